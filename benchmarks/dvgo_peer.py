@@ -99,7 +99,7 @@ class Peer:
         from lib import dvgo, utils
 
         self.module, config = module, module.config
-        low, high = module.field.grid.box.tolist()
+        low, high = module.field.grid.aabb.tolist()
         sizes = {"num_voxels": args.voxels, "num_voxels_base": args.voxels}
         with tempfile.TemporaryDirectory() as folder:
             self.model = dvgo.DirectVoxGO(
@@ -119,7 +119,7 @@ class Peer:
     @staticmethod
     def _saved(coarse: VoxelField, folder: Path) -> str:
         """The coarse field as the peer's own checkpoint."""
-        low, high = coarse.grid.box.tolist()
+        low, high = coarse.grid.aabb.tolist()
         about = {"xyz_min": low, "xyz_max": high, "act_shift": coarse.vertex_shift}
         about["voxel_size_ratio"] = coarse.grid.voxel / coarse.space.measure
         density = as_volume(coarse.density.detach(), coarse.grid.shape)[None]

@@ -61,8 +61,8 @@ def compared(**_: object) -> None:
 
 
 def agree(**_: object) -> None:
-    """Test replayed steps, kernels, gradients and waits."""
-    chosen = "replayed or kernels or gradients or waits"  # types are checked only of what is not imported yet
+    """Test kernels, gradients and waits."""
+    chosen = "kernels or gradients or waits"  # types are checked only of what is not imported yet
     sys.exit(pytest.main(["-q", "-o", "addopts=", "tests/test_gpu.py", "-k", chosen]))
 
 

@@ -30,7 +30,7 @@ from ctm_plugin.optim.grid_adam import step_table
 from ctm_plugin.rays.cameras import Rays
 from ctm_plugin.rays.grid import VoxelGrid, corners, scattered, weighted
 from ctm_plugin.rays.hash_grid import HashGrid, encoded, spread
-from ctm_plugin.rays.occupancy import occupied_samples, placed_samples
+from ctm_plugin.rays.occupancy import occupied_samples
 from ctm_plugin.rays.sampling import intersect_box, sample_counts
 from ctm_plugin.rays.volume import volume_weights
 from ctm_plugin.scene.views import Scene, Views
@@ -50,19 +50,17 @@ def cases(device: torch.device, side: int, rays: int, entries: int) -> Iterator[
     """What is done, by which function, with what, and bytes it has to move."""
     torch.manual_seed(0)
     grid = VoxelGrid(torch.tensor([[-1.0] * 3, [1.0] * 3]), (side,) * 3).to(device)
-    buffers, count = (grid.box[0], grid.scale, grid.last, grid.offsets), grid.count
+    buffers, count = (grid.aabb[0], grid.scale, grid.last, grid.offsets), grid.count
     origins = 3 * F.normalize(torch.randn(rays, 3), dim=1)
     to = F.normalize(torch.rand(rays, 3) - 0.5 - origins, dim=1)
     bundle, step = Rays(origins.to(device), to.to(device)), 0.5 * grid.voxel
-    enter, leave = intersect_box(bundle, grid.box, 1.0, 5.0)
+    enter, leave = intersect_box(bundle, grid.aabb, 1.0, 5.0)
     counts = sample_counts(enter, leave, step, 0.5)
     occupied = (grid.vertices().norm(dim=1) - 0.55).abs() < 3 * grid.voxel  # the shell of an object
     of_samples = *bundle, enter + 0.5 * step, counts, step, occupied, *buffers
     _, ray_index, points = occupied_samples.reference(*of_samples)
     m, all_of_them = len(points), int(counts.sum())
     yield f"samples outside free space, {m:,} of {all_of_them:,}", occupied_samples, of_samples, all_of_them + 24 * m
-    spare = rays + torch.arange(m + m // 4, device=device) // 64
-    yield "the same, with places", placed_samples, (*of_samples, False, spare), all_of_them + 24 * len(spare)
     yield f"corners of {m:,} points", corners, (points, *buffers), 76 * m
     rows, shares = corners.reference(points, *buffers)
     touched = len(rows.unique())
@@ -138,7 +136,7 @@ def training(module: OccupiedBackbone) -> Callable[[], None]:
     if isinstance(module, NGP):
         field.allowed.copy_(shell)
         field.occupy(shell)
-    optimizers, module.replayed = module.configure_optimizers(), True
+    optimizers = module.configure_optimizers()
 
     def step() -> None:
         with torch.autocast(device, torch.bfloat16, enabled=device == "cuda"):

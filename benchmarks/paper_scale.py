@@ -24,7 +24,10 @@ from dataclasses import dataclass, fields
 from itertools import product
 from pathlib import Path
 
-from ctm_plugin.report.evidence import COLUMNS, row_of
+sys.path.append(str(Path(__file__).parents[1] / "docs" / "evidence"))
+
+from scores import COLUMNS, row_of
+
 from ctm_plugin.report.runs import read_run
 from ctm_plugin.runs.rundir import CONFIG, LAST, METRICS
 from ctm_plugin.settings.build import build, pairs

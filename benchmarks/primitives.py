@@ -103,7 +103,7 @@ def main() -> None:
 
     space = Box(torch.tensor([[-1.0] * 3, [1.0] * 3]), 1.0, 5.0, 5.0)
     color = ViewMLP(features=12, channels=3, width=128, depth=3, frequencies=4)
-    field = VoxelField(space, (64, 64, 64), 12, color, threshold=1e-4, step=0.5, shift=-4.6)
+    field = VoxelField(space, (64, 64, 64), 12, color, alpha_thre=1e-4, step=0.5, shift=-4.6)
     field.occupancy[:] = field.grid.vertices().norm(dim=1) < 0.6
     origins = 3 * F.normalize(torch.randn(1024, 3), dim=1)
     rays = Rays(origins, F.normalize(torch.rand(1024, 3) - 0.5 - origins, dim=1))

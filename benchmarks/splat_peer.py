@@ -67,8 +67,8 @@ def theirs(view: Callable[..., Tensor], gaussians: Gaussians, camera: Camera, ba
     frustum[3, 2] = 1
     directions = gaussians.means.detach() - camera.centre
     return view(
-        gaussians.means, gaussians.scales.exp(), gaussians.turns / gaussians.turns.norm(dim=-1, keepdim=True),
-        gaussians.opacities.sigmoid(), gaussians.base[:, None], directions / directions.norm(dim=-1, keepdim=True),
+        gaussians.means, gaussians.scales.exp(), gaussians.quats / gaussians.quats.norm(dim=-1, keepdim=True),
+        gaussians.opacities.sigmoid(), gaussians.sh0[:, None], directions / directions.norm(dim=-1, keepdim=True),
         pose, frustum @ pose, camera.lens.tolist(), camera.height, camera.width, background,
     )  # fmt: skip
 

@@ -19,7 +19,7 @@ from ctm_plugin.optim.grid_adam import GridAdam
 from ctm_plugin.scene.views import Views
 from ctm_plugin.settings.build import pairs
 from ctm_plugin.splats.gaussians import Camera, Gaussians, camera_of
-from ctm_plugin.splats.render import PLANE, picture
+from ctm_plugin.splats.render import PLANE_CHANNELS, picture
 
 SIZES = ((250, 187), (500, 375))
 COUNTS = (10_000, 30_000, 50_000)
@@ -74,7 +74,7 @@ def measure(count: int, width: int, height: int) -> dict[str, float]:
 
     def view() -> None:
         with torch.no_grad():
-            picture(gaussians, camera, shift, DEGREES, 0.0, PLANE)
+            picture(gaussians, camera, shift, DEGREES, 0.0, PLANE_CHANNELS)
 
     def both() -> None:
         picture(gaussians, camera, shift, DEGREES, 0.0, 0)[0].mean().backward()

@@ -18,13 +18,11 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from contextlib import AbstractContextManager
 from dataclasses import dataclass, fields
 from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
-from unittest.mock import patch
 
 import lightning as L
 import torch
@@ -36,14 +34,11 @@ from rich.table import Table
 from torch.profiler import ProfilerActivity, profile, record_function
 
 from ctm_plugin.backbones.base import Backbone
-from ctm_plugin.callbacks.attach_ctm import AttachTransform
 from ctm_plugin.callbacks.stopwatch import peak_memory_mb, synchronise
-from ctm_plugin.color.transform import fitted
+from ctm_plugin.color.transform import ColorTransform, fitted
 from ctm_plugin.cpu.allocator import keep_memory
 from ctm_plugin.cpu.products import fast_products
 from ctm_plugin.errors import ConfigError, CTMError
-from ctm_plugin.gpu import replay
-from ctm_plugin.rays.packing import WATCHED
 from ctm_plugin.runs.assemble import Parts, assemble, color_transform
 from ctm_plugin.runs.compose import compose, explain
 from ctm_plugin.settings.build import build, pairs
@@ -90,15 +85,15 @@ class Side:
 
     Args:
         module: no longer a Trainer's.
-        attach: puts the transform in.
+        transform: takes the place of the module's, unless it is ``None``.
         bf16: run under autocast.
     """
 
-    def __init__(self, module: Backbone, attach: AttachTransform, bf16: bool):
+    def __init__(self, module: Backbone, bf16: bool, transform: ColorTransform | None = None):
         self.module, self.bf16 = module, bf16
-        attach.attach(module)
-        attach.transform.to(module.device)
-        fitted(attach.transform, module.some_colors())
+        if transform is not None:
+            module.transform = transform.to(module.device)
+        fitted(module.transform, module.some_colors())
         self.optimizers = module.configure_optimizers()
         for name, member in self.optimizers.members.items():
             for group in member.param_groups if name != "ctm" else ():
@@ -144,19 +139,19 @@ def measure(
         CTMError: the configuration cannot be used.
     """
     keep_memory()
-    chosen = [f"backbone={backbone}", "ctm=on", "trainer=quick", "trainer.replay=true", *overrides]
+    chosen = [f"backbone={backbone}", "ctm=on", "trainer=quick", *overrides]
     on, off = compose(*chosen), compose(*chosen, "ctm=off")
     if on["ctm"].get("name") == "none":
         raise ConfigError("ctm", "off", "a transform to compare with ctm=off")
     parts = assemble(off)
-    transform, training = color_transform(on, on["seed"])
+    transform = color_transform(on, on["seed"])
     if transform.channels != parts.backbone.channels:
         raise ConfigError("ctm.k", transform.channels, f"{parts.backbone.channels}: both sides render the same field")
-    attach = {"off": parts.attach} | ({"on": AttachTransform(transform, training)} if compared else {})
+    sides = {"off": None} | ({"on": transform} if compared else {})
     device = warm(parts, WARM_UP.get(backbone, FEW) if warm_up is None else warm_up)
     bf16 = parts.trainer.numbers == "bf16-mixed"
     with fast_products(device):
-        found = clock({name: Side(copy.deepcopy(parts.backbone), each, bf16) for name, each in attach.items()}, steps)
+        found = clock({name: Side(copy.deepcopy(parts.backbone), bf16, each) for name, each in sides.items()}, steps)
     name = torch.cuda.get_device_name(device) if device.type == "cuda" else "CPU"
     where = {"device": name, "threads": torch.get_num_threads(), "torch": torch.__version__}
     told = {"backbone": backbone, "overrides": list(overrides), "precision": parts.trainer.numbers, **where}
@@ -171,7 +166,7 @@ def warm(parts: Parts, steps: int) -> torch.device:
     module = parts.backbone
     trainer = L.Trainer(
         accelerator=parts.trainer.backend, devices=1, max_steps=min(steps, module.total_steps),
-        precision=parts.trainer.numbers, callbacks=[parts.attach], logger=False, enable_checkpointing=False,
+        precision=parts.trainer.numbers, logger=False, enable_checkpointing=False,
         enable_progress_bar=False, enable_model_summary=False,
     )  # fmt: skip
     device = trainer.strategy.root_device
@@ -185,12 +180,11 @@ def warm(parts: Parts, steps: int) -> torch.device:
 def clock(sides: dict[str, Side], steps: int) -> dict[str, Any]:
     """Time the sides' steps in turns, then their parts and a view: milliseconds and rates by name."""
     times: dict[str, list[float]] = {name: [] for name in sides}
-    first = WATCHED + 2 if next(iter(sides.values())).module.device.type == "cuda" else 2  # then steps are replayed
-    for step in range(steps + first):
+    for step in range(steps + 2):
         # The first with new rays pays for memory of new sizes: they take turns.
         for name in list(sides)[:: 1 if step % 2 else -1]:
             seconds = _seconds(sides[name].step, sides[name].module.device)
-            if step >= first:
+            if step >= 2:
                 times[name].append(seconds)
     found: dict[str, Any] = {}
     for name, side in sides.items():
@@ -208,15 +202,8 @@ def clock(sides: dict[str, Side], steps: int) -> dict[str, Any]:
         found[name]["view_ms"] = min(_seconds(view, module.device) for _ in range(4)) * 1e3
     for name, side in sides.items():  # when all clocks have stopped
         found[name] |= profiled(side.step, side.module.device, PROFILED)
-        with one_by_one():  # the profiler knows no products of what is replayed
-            found[name]["product_tflop"] = profiled(side.step, side.module.device, 1)["product_tflop"]
         found[name]["product_tflops"] = 1e3 * found[name]["product_tflop"] / found[name]["step_ms"]
     return found | ({"ratio": ratio(times["on"], times["off"])} if "on" in found else {})
-
-
-def one_by_one() -> AbstractContextManager[object]:
-    """Within it, no step is replayed."""
-    return patch.object(replay, "may_record", lambda _: False)
 
 
 def _seconds(work: Callable[[], object], device: torch.device) -> float:
@@ -248,9 +235,9 @@ def _pairs(times: Sequence[float]) -> Sequence[float]:
 def parts_of(side: Side, seconds: float) -> dict[str, float]:
     """Share a step's milliseconds out to its parts: the profiler's shares of the ``seconds`` it took without it.
 
-    By the host's time, of one operator at a time: on a GPU what it waits for counts where it does.
+    By the host's time: on a GPU what it waits for counts where it does.
     """
-    with one_by_one(), profile(activities=[ProfilerActivity.CPU]) as profiler:
+    with profile(activities=[ProfilerActivity.CPU]) as profiler:
         for _ in range(PROFILED):
             side.step()
             synchronise(side.module.device)

@@ -26,10 +26,10 @@ def main() -> None:
     parts = assemble(compose(*sys.argv[1:]))
     # One step: what comes before it is what is looked at.
     L.Trainer(
-        max_steps=1, callbacks=[parts.attach], logger=False, enable_checkpointing=False,
+        max_steps=1, logger=False, enable_checkpointing=False,
         enable_progress_bar=False, enable_model_summary=False, accelerator="cpu",
     ).fit(parts.backbone)  # fmt: skip
-    field, ctm, draws = parts.backbone, parts.attach.transform, Draws(1, 0)
+    field, ctm, draws = parts.backbone, parts.backbone.transform, Draws(1, 0)
     with torch.no_grad():
         seen, other = field.scene_colors(draws, PAIRS), field.scene_colors(draws, PAIRS)
         random, latent, share = draws.uniform(PAIRS, 3), draws.uniform(PAIRS, ctm.channels), draws.uniform(PAIRS, 1)

@@ -6,7 +6,8 @@
 from importlib import import_module
 
 __version__ = "0.10.0"
-FRONT = {"Auto": "color.auto", "CTM": "color.ctm"} | dict.fromkeys(("fit", "load_run", "losses", "transform"), "front")
+FRONT = {"Auto": "color.auto", "CTM": "color.ctm", "AttachTransform": "callbacks.attach_ctm"}
+FRONT |= dict.fromkeys(("fit", "load_run", "losses", "transform"), "front")
 """Names for other programs, and the modules that have them."""
 
 

@@ -8,15 +8,21 @@ import sys
 import threading
 import traceback
 import warnings
+from argparse import Namespace
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-import hydra
+from hydra._internal.callbacks import Callbacks
+from hydra._internal.hydra import Hydra
+from hydra._internal.utils import get_args_parser
+from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
+from hydra.core.override_parser.types import Quote, QuotedString
+from hydra.core.utils import run_job
 from hydra.errors import HydraException
-from hydra.types import RunMode
-from omegaconf import DictConfig
+from hydra.types import HydraContext, RunMode
+from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from rich.console import Console
 
@@ -24,30 +30,37 @@ from ctm_plugin import __version__
 from ctm_plugin.cpu.threads import let_waiting_threads_sleep
 from ctm_plugin.errors import ConfigError, CTMError, Interrupted
 from ctm_plugin.runs.choices import told, with_fitting_dataset
-from ctm_plugin.runs.compose import GROUPS, check, conf_dir, decided, explain, prepared, resolved, undecided
+from ctm_plugin.runs.compose import (
+    GROUPS,
+    at_work,
+    check,
+    check_values,
+    composed,
+    conf_dir,
+    elsewhere,
+    explain,
+    prepared,
+    without_hydras,
+)
 from ctm_plugin.settings import commands
 from ctm_plugin.settings.as_typed import is_sweep
 from ctm_plugin.settings.build import SECTIONS, unknown_key
 from ctm_plugin.settings.listing import plain, print_choices, print_keys, print_names
 from ctm_plugin.settings.registry import REGISTRIES
 
-USERS = (CTMError, HydraException, OmegaConfBaseException, OSError)
+USER_ERRORS = (CTMError, HydraException, OmegaConfBaseException, OSError)
 """Errors that a user can mend; others are bugs, of ours or of another package's."""
-REQUEUE = 75
-"""Exit code after SIGTERM, with which clusters end a job to run it again: ``EX_TEMPFAIL`` of sysexits.h."""
+REQUEUE_CODE = 75
+"""Exit code after SIGTERM, on which clusters run a job again: ``EX_TEMPFAIL`` of sysexits.h."""
 
-USUAL = ("dataset", "backbone", "ctm", "trainer")
-"""Groups that people choose from, which the help names; ``ctm list`` has all."""
-
-
-class _Failed(BaseException):
-    """On the way of a user's error, its cause, past Hydra, which would print a line of its own before it."""
+MAIN_GROUPS = ("dataset", "backbone", "ctm", "trainer")
+"""Groups whose choices the help names; ``ctm list`` has all."""
 
 
-@hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name="config")
 def run(config: DictConfig) -> float | None:
     """Run one job, single or of a sweep; returns its PSNR, for sweepers that search."""
     from ctm_plugin.cpu.allocator import give_back
+    from ctm_plugin.runs.decide import decide
     from ctm_plugin.runs.processes import is_main_process
     from ctm_plugin.runs.rundir import ERROR, LAST, new_folder
     from ctm_plugin.runs.sweep import go_on
@@ -64,25 +77,24 @@ def run(config: DictConfig) -> float | None:
     try:
         if going_on and not several:
             raise ConfigError("sweep.resume", going_on, "false without -m: a single run goes on by resume=RUN_DIR")
-        settings = resolved(config, list(job.overrides.task))
+        capture = decide(config)
+        settings = without_hydras(config)
         if going_on:
-            metrics = go_on(settings, Path(job.sweep.dir), folder)
+            metrics = go_on(settings, Path(job.sweep.dir), folder, capture)
         else:
-            metrics = train(settings, folder, print_line if several else print_summary)
+            metrics = train(settings, folder, print_line if several else print_summary, capture)
         return metrics.get("psnr")
     except Interrupted as stop:
         raise KeyboardInterrupt(str(stop)) from stop  # Hydra would go on with the next job of a sweep
     except Exception as error:
         if not several:
-            if isinstance(error, USERS):
-                raise _Failed from error
             raise
-        told = f"error in job {job.job.num} ({' '.join(job.overrides.task)}): {explain(error)}"
-        if not isinstance(error, USERS):
-            told += f"\n{traceback.format_exc()}"
-        print(told, file=sys.stderr)
+        text = f"error in job {job.job.num} ({' '.join(job.overrides.task)}): {explain(error)}"
+        if not isinstance(error, USER_ERRORS):
+            text += f"\n{traceback.format_exc()}"
+        print(text, file=sys.stderr)
         with suppress(OSError):
-            (folder / ERROR).write_text(f"{told}\n", encoding="utf-8")  # for reports on the sweep
+            (folder / ERROR).write_text(f"{text}\n", encoding="utf-8")  # for reports on the sweep
         raise error.with_traceback(None) from None  # Hydra keeps it, and it the run in memory
     finally:
         give_back()
@@ -105,8 +117,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             _run(arguments)
     except (KeyboardInterrupt, Interrupted) as stop:
         return _stopped(stop)
-    except (_Failed, *USERS) as failed:
-        error = failed.__cause__ if isinstance(failed, _Failed) else failed
+    except USER_ERRORS as error:
         print(f"error: {explain(error)}", file=sys.stderr)
         return 2 if isinstance(error, commands.UsageError) else 1
     return 0
@@ -123,7 +134,7 @@ def _run(arguments: list[str]) -> None:
     elif {"-h", "--help"} & set(arguments):
         commands.print_verbs()
         print()
-        print_names(Console(), conf_dir(), USUAL)
+        print_names(Console(), conf_dir(), MAIN_GROUPS)
     elif {"-V", "--version"} & set(arguments):
         print(f"ctm_plugin {__version__}")
     else:
@@ -147,7 +158,8 @@ def print_list(*groups: Path, others: Sequence[str] = ()) -> None:
     shown = dict.fromkeys(argument.lstrip("+").replace("=", ".").partition(".")[0] for argument in named)
     if unknown := [group for group in shown if group not in SECTIONS]:
         raise unknown_key(unknown[0], SECTIONS)
-    config = undecided(ready)
+    with at_work():
+        config = without_hydras(composed(ready))
     for group in shown:
         name = config[group].get("name", "")
         registry = REGISTRIES.get(group)
@@ -159,15 +171,75 @@ def print_list(*groups: Path, others: Sequence[str] = ()) -> None:
 def _train(arguments: Sequence[str]) -> None:
     if any(_is_resume(argument) for argument in arguments):
         _resume(arguments)
+        return
+    given, arguments = arguments, with_fitting_dataset(arguments)
+    if len(arguments) > len(given):
+        print(f"{arguments[0]}, which reads that folder", file=sys.stderr)
+    ready, parser = prepared(arguments), get_args_parser()
+    parser.prog = "ctm"
+    flags = parser.parse_intermixed_args(ready)
+    name, overrides = flags.config_name or "config", [*flags.overrides, *_searched(flags.config_dir)]
+    with at_work(flags.config_path):
+        own = GlobalHydra.instance().hydra
+        if flags.hydra_help:
+            own.hydra_help(name, parser, flags)
+        elif flags.info:
+            own.show_info(flags.info, name, overrides)
+        elif is_sweep(ready) and not flags.cfg:
+            if not elsewhere(ready):
+                check_values(composed(ready), ready)
+            own.multirun(name, run, [*overrides, "hydra.mode=MULTIRUN"])
+        else:
+            config = composed(overrides, name, whole=True)
+            if not elsewhere(ready):
+                check_values(config, ready)
+            if flags.cfg:
+                _print_one(own, config, flags)
+            else:
+                _run_one(own, config, name)
+
+
+def _searched(folder: str | None) -> list[str]:
+    """The override that has Hydra look for choices in this folder too."""
+    if folder is None:
+        return []
+    if not os.path.isdir(folder):
+        raise ConfigError("--config-dir", folder, "a folder with choices")
+    return [f"hydra.searchpath=[{QuotedString(f'file://{os.path.abspath(folder)}', Quote.single).with_quotes()}]"]
+
+
+def _print_one(own: Hydra, config: DictConfig, flags: Namespace) -> None:
+    """Print a configuration as Hydra does, but with what is left to the program."""
+    from ctm_plugin.runs.decide import decide
+
+    decide(config)
+    HydraConfig.instance().set_config(config)
+    OmegaConf.set_readonly(config.hydra, None)
+    part = own.get_sanitized_cfg(config, flags.cfg)
+    if package := flags.package:
+        part = OmegaConf.select(part, package)
+    if OmegaConf.is_config(part):
+        print(f"# @package {package}\n" * bool(package) + OmegaConf.to_yaml(part, resolve=flags.resolve), end="")
     else:
-        given, arguments = arguments, with_fitting_dataset(arguments)
-        if len(arguments) > len(given):
-            print(f"{arguments[0]}, which reads that folder", file=sys.stderr)
-        arguments = check(arguments)
-        if "--cfg" in arguments and not is_sweep(arguments):  # Hydra prints what it composes before it is decided
-            arguments = decided(arguments)
-        with _hydras_arguments(arguments):
-            run()
+        print(part)
+
+
+def _run_one(own: Hydra, config: DictConfig, name: str) -> None:
+    """Run a single job as Hydra does, but for its second composition, and its line before an error."""
+    config.hydra.mode, failed = RunMode.RUN, []
+
+    def job(settings: DictConfig) -> float | None:
+        try:
+            return run(settings)
+        except Exception as error:
+            failed.append(error)
+
+    callbacks = Callbacks(config)
+    callbacks.on_run_start(config=config, config_name=name)
+    done = run_job(job, config, "hydra.run.dir", None, HydraContext(own.config_loader, callbacks))
+    callbacks.on_run_end(config=config, config_name=name, job_return=done)
+    if failed:
+        raise failed[0]
 
 
 def _stopped(stop: BaseException) -> int:
@@ -176,7 +248,7 @@ def _stopped(stop: BaseException) -> int:
     if is_main_process():  # of several, one tells it
         print(str(stop) or "stopped", file=sys.stderr)
     cause = stop if isinstance(stop, Interrupted) else stop.__cause__
-    return REQUEUE if isinstance(cause, Interrupted) and cause.by == signal.SIGTERM else 130
+    return REQUEUE_CODE if isinstance(cause, Interrupted) and cause.by == signal.SIGTERM else 130
 
 
 def _is_resume(argument: str) -> bool:
@@ -199,7 +271,7 @@ def _resume(arguments: Sequence[str]) -> None:
 @contextmanager
 def _a_line_each() -> Iterator[None]:
     """Warnings without the place in the code, each once; nothing of threads whose errors come here later."""
-    told: set[str] = set()
+    lines: set[str] = set()
     shown, failed = warnings.formatwarning, threading.excepthook
 
     def unless_told_later(error: threading.ExceptHookArgs) -> None:
@@ -208,8 +280,8 @@ def _a_line_each() -> Iterator[None]:
 
     def once(message: Warning | str, *_: object, **__: object) -> str:
         line = f"warning: {message}\n"
-        new = line not in told  # a command reads its data more than once
-        told.add(line)
+        new = line not in lines  # a command reads its data more than once
+        lines.add(line)
         return line * new
 
     warnings.formatwarning = once
@@ -218,23 +290,3 @@ def _a_line_each() -> Iterator[None]:
         yield
     finally:
         warnings.formatwarning, threading.excepthook = shown, failed
-
-
-@contextmanager
-def _hydras_arguments(arguments: Sequence[str]) -> Iterator[None]:
-    """Hydra reads ``sys.argv``, flags first, and tells its errors to us only if the environment says so."""
-    argv, full = sys.argv, os.environ.get("HYDRA_FULL_ERROR")
-    flags = [
-        argument
-        for before, argument in zip(["", *arguments], arguments, strict=False)
-        if argument.startswith("-") or (before in commands.FLAGS and "=" not in argument)
-    ]
-    sys.argv = ["ctm_plugin", *flags, *(argument for argument in arguments if argument not in flags)]
-    os.environ["HYDRA_FULL_ERROR"] = "1"
-    try:
-        yield
-    finally:
-        sys.argv = argv
-        del os.environ["HYDRA_FULL_ERROR"]
-        if full is not None:
-            os.environ["HYDRA_FULL_ERROR"] = full

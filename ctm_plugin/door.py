@@ -16,8 +16,8 @@ import torch
 from torch import Tensor, nn
 
 registered: dict[str, Callable] = {}
-"""Every function that has a loop or a kernel, by its module's name and its own; ``reference`` of it is the plain one,
-``loop`` and ``kernel`` are their names, ``None`` of none."""
+"""Every function with a loop or a kernel, by module and name. ``reference`` of it is plain torch; ``loop`` and
+``kernel`` are names or ``None``."""
 
 
 def looped(

@@ -63,46 +63,6 @@ class FixedDraws(Draws):
         return torch.zeros(rows, channels, device=self.device)
 
 
-class NotedDraws(Draws):
-    """Draws of which is noted what was asked for, ``(kind, sizes)``, and what was given."""
-
-    def __init__(self, draws: Draws):
-        self.draws, self.device, self.rank, self.world = draws, draws.device, draws.rank, draws.world
-        self.asked: list[tuple[str, tuple[int, int]]] = []
-        self.given: list[Tensor] = []
-
-    def uniform(self, rows: int, channels: int) -> Tensor:
-        return self._note("uniform", rows, channels)
-
-    def normal(self, rows: int, channels: int) -> Tensor:
-        return self._note("normal", rows, channels)
-
-    def integers(self, high: int, rows: int) -> Tensor:
-        return self._note("integers", high, rows)
-
-    def _note(self, kind: str, *sizes: int) -> Tensor:
-        self.asked.append((kind, sizes))
-        self.given.append(getattr(self.draws, kind)(*sizes))
-        return self.given[-1]
-
-
-class KnownDraws(Draws):
-    """Draws that were made before: ``given`` ``[...]``, in the order in which they are asked for."""
-
-    def __init__(self, draws: Draws, given: list[Tensor]):
-        self.device, self.rank, self.world = draws.device, draws.rank, draws.world
-        self.left = iter(given)
-
-    def uniform(self, rows: int, channels: int) -> Tensor:
-        return next(self.left)
-
-    def normal(self, rows: int, channels: int) -> Tensor:
-        return next(self.left)
-
-    def integers(self, high: int, rows: int) -> Tensor:
-        return next(self.left)
-
-
 @contextmanager
 def seeded(seed: int) -> Iterator[None]:
     """Initialise parameters from a seed of their own: two models that differ elsewhere start alike."""

@@ -10,14 +10,14 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-LONGEST = 600
-"""Characters of a part of a message: what was found may be a whole file."""
+MAX_CHARACTERS = 600
+"""Most characters of a message's part: what was found may be a whole file."""
 
 
 def printable(what: object) -> str:
     """One line of text: control characters escaped, what is long cut in the middle."""
     text = "".join(each if each.isprintable() else each.encode("unicode_escape").decode() for each in str(what))
-    return text if len(text) <= LONGEST else f"{text[: LONGEST // 2]}...{text[-LONGEST // 2 :]}"
+    return text if len(text) <= MAX_CHARACTERS else f"{text[: MAX_CHARACTERS // 2]}...{text[-MAX_CHARACTERS // 2 :]}"
 
 
 class CTMError(Exception):
@@ -68,8 +68,8 @@ class DivergedError(CTMError):
     """A loss term or a parameter became NaN or infinite."""
 
     def __init__(self, step: int, what: str, value: float, kept: Path):
-        found = kept if kept.exists() else "none yet"
-        super().__init__(f"step {step}: {what} is {value}; training stopped, last good checkpoint kept: {found}")
+        last = kept if kept.exists() else "none yet"
+        super().__init__(f"step {step}: {what} is {value}; training stopped, last good checkpoint kept: {last}")
 
 
 class Interrupted(CTMError):

@@ -82,7 +82,7 @@ def create(path: Path, text: str) -> None:
         beside.unlink(missing_ok=True)
 
 
-def check_zip(path: Path, most: int | None = None) -> None:
+def check_zip(path: Path, max_bytes: int | None = None) -> None:
     """Read a ZIP file through and compare its check sums, which torch does not do.
 
     Args:
@@ -93,7 +93,7 @@ def check_zip(path: Path, most: int | None = None) -> None:
         zipfile.BadZipFile: it is damaged, none, or holds more.
     """
     with zipfile.ZipFile(path) as archive:
-        if sum(entry.file_size for entry in archive.infolist()) > (most or path.stat().st_size):
+        if sum(entry.file_size for entry in archive.infolist()) > (max_bytes or path.stat().st_size):
             raise zipfile.BadZipFile("more than it should hold")
         if damaged := archive.testzip():
             raise zipfile.BadZipFile(damaged)

@@ -8,21 +8,21 @@ import torch
 from hydra.errors import HydraException
 from jaxtyping import Float
 from torch import Tensor
-from torch.optim import Adam
+from torch.optim import Optimizer
 
-from ctm_plugin.callbacks.attach_ctm import adam_of, prepare
 from ctm_plugin.color.photometric import Photometric
+from ctm_plugin.color.prepare import adam_of, prepare
 from ctm_plugin.color.transform import ColorTransform
 from ctm_plugin.draws import Draws
 from ctm_plugin.errors import ConfigError, CTMError
 from ctm_plugin.runs.assemble import color_transform
 from ctm_plugin.runs.compose import compose, conf_dir, explain
-from ctm_plugin.runs.load import Run, load_posed
+from ctm_plugin.runs.load import LoadedRun, load_posed
 from ctm_plugin.settings.listing import names
 from ctm_plugin.settings.registry import COLOR_SPACES
 
-KEYS = ("ctm.", "color_space.")
-"""What keys of a transform begin with."""
+KEY_PREFIXES = ("ctm.", "color_space.", "color_space=")
+"""Prefixes of a transform's keys."""
 
 
 def transform(name: str = "auto", *keys: str, seed: int = 0) -> ColorTransform:
@@ -30,7 +30,7 @@ def transform(name: str = "auto", *keys: str, seed: int = 0) -> ColorTransform:
 
     Args:
         name: what the command line calls it: a choice of ``ctm`` (``auto``, ``on``, ``quick``), or a colour space.
-        keys: settings of it, as on the command line: ``ctm.k=4``.
+        keys: settings of it, as on the command line: ``ctm.k=4``; ``color_space=NAME`` under a choice of ``ctm``.
         seed: of its first weights.
 
     Raises:
@@ -44,40 +44,41 @@ def transform(name: str = "auto", *keys: str, seed: int = 0) -> ColorTransform:
     if name not in choices + spaces:
         raise ConfigError("transform", name, f"one of {', '.join(choices + spaces)}")
     for key in keys:
-        if not key.startswith(KEYS):
-            raise ConfigError("transform", key, f"settings of the transform: {' or '.join(KEYS)}KEY=VALUE")
+        if not key.startswith(KEY_PREFIXES):
+            raise ConfigError("transform", key, "settings of the transform: ctm.KEY, color_space or color_space.KEY")
     chosen = [f"ctm={name}"] if name in choices else ["ctm=off", f"color_space={name}"]
     try:
-        config = compose(*chosen, *keys)
+        return color_transform(compose(*chosen, *keys), seed)
     except HydraException as error:
         raise CTMError(explain(error)) from error
-    made, made.learning = color_transform(config, seed)
-    return made
 
 
-def fit(transform: ColorTransform, colors: Float[Tensor, "n 3"], seed: int = 0) -> Adam | None:
+def fit(
+    transform: ColorTransform, colors: Float[Tensor, "n 3"], seed: int = 0, optimizer: Optimizer | None = None
+) -> Optimizer | None:
     """Fit a transform to a scene, before anything is trained in its colours, and pre-train it if its settings say so.
 
     Args:
         transform: on the device of ``colors``.
         colors: sRGB in [0, 1], of training pixels, some ten thousand.
         seed: of what is drawn from them.
+        optimizer: the transform's own, of one parameter group; ``None``: an Adam is made.
 
     Returns:
-        The transform's own optimizer, to be stepped with the field's; ``None`` if the transform has no parameters.
+        That, to be stepped with the field's; ``None`` if the transform has no parameters.
 
     Raises:
         ConfigError: ``ctm.lr_decay`` is not 1.
     """
     if transform.learning.lr_decay != 1:
         raise ConfigError("ctm.lr_decay", transform.learning.lr_decay, "1: your training schedules the optimizer")
-    adam = adam_of(transform, transform.learning)
+    optimizer = optimizer or adam_of(transform)
 
     def drawn(draws: Draws, count: int) -> Tensor:
         return colors[draws.integers(len(colors), count)]
 
-    prepare(transform, transform.learning, adam, drawn, seed, colors.device)
-    return adam
+    prepare(transform, optimizer, drawn, seed, colors.device)
+    return optimizer
 
 
 def losses(
@@ -107,7 +108,7 @@ def losses(
         return transform.losses([latent.float()], rgb.float(), photometric, uniform).terms
 
 
-def load_run(run: str | Path) -> Run:
+def load_run(run: str | Path) -> LoadedRun:
     """Read a run of a scene with cameras, from its directory or its checkpoint's last state.
 
     Returns:

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from ctm_plugin.scene.views import Views
-from ctm_plugin.splats.gaussians import LEAST, MOST, Camera, Gaussians, Projected, camera_of, project
+from ctm_plugin.splats.gaussians import MAX_ALPHA, MIN_ALPHA, Camera, Gaussians, ProjectedGaussians, camera_of, project
 from ctm_plugin.splats.render import picture
 
 LENS = (0.05, -0.2, 0.003, -0.002, 0.01)
@@ -48,7 +48,7 @@ class Setting(NamedTuple):
         shift = torch.zeros(len(tables.means), 2, dtype=dtype, requires_grad=True)
         return tables, shift, *run(tables, of_type(self.camera, dtype), shift, self.degrees, FLOOR, more)
 
-    def projected(self) -> Projected:
+    def projected(self) -> ProjectedGaussians:
         """In float64."""
         tables = Gaussians(*(each.double() for each in self.gaussians))
         shift = torch.zeros(len(tables.means), 2, dtype=torch.float64)
@@ -82,10 +82,10 @@ def setting(
     gaussians = Gaussians(
         means=spread * normal(count, 3),
         scales=0.4 * normal(count, 3) + torch.tensor(sizes),
-        turns=normal(count, 4),
+        quats=normal(count, 4),
         opacities=1.5 * normal(count, 1) + opacity,
-        base=0.8 * normal(count, channels) + 0.5,
-        rest=0.2 * normal(count, (degrees**2 - 1) * channels),
+        sh0=0.8 * normal(count, channels) + 0.5,
+        shN=0.2 * normal(count, (degrees**2 - 1) * channels),
     )
     turn, _ = torch.linalg.qr(torch.eye(3) + 0.1 * normal(3, 3))
     turn = turn * turn.diagonal().sign()
@@ -94,7 +94,7 @@ def setting(
     return Setting(gaussians, camera_of(views, 0, NEAR), degrees)
 
 
-def pixel_by_pixel(projected: Projected, camera: Camera) -> tuple[Tensor, Tensor]:
+def pixel_by_pixel(projected: ProjectedGaussians, camera: Camera) -> tuple[Tensor, Tensor]:
     """The picture ``[k, H, W]`` in float64, and the light that is left, ``[H, W]``."""
     names = ("means", "conics", "opacities", "colors", "depths", "extents")
     means, conics, opacities, colors, depths, extents = (
@@ -107,14 +107,14 @@ def pixel_by_pixel(projected: Projected, camera: Camera) -> tuple[Tensor, Tensor
             for each in order:
                 x, y = column + 0.5 - means[each, 0], row + 0.5 - means[each, 1]
                 a, b, c = conics[each]
-                alpha = min(opacities[each] * math.exp(-0.5 * (a * x * x + 2 * b * x * y + c * y * y)), MOST)
-                if alpha >= LEAST:
+                alpha = min(opacities[each] * math.exp(-0.5 * (a * x * x + 2 * b * x * y + c * y * y)), MAX_ALPHA)
+                if alpha >= MIN_ALPHA:
                     image[:, row, column] += left[row, column] * alpha * colors[each]
                     left[row, column] *= 1 - alpha
     return torch.from_numpy(image), torch.from_numpy(left)
 
 
-def alphas(projected: Projected, camera: Camera) -> Tensor:
+def alphas(projected: ProjectedGaussians, camera: Camera) -> Tensor:
     """What each Gaussian stops at each pixel, before any bound: ``[N, H, W]``; of those that are shown, else 0."""
     y, x = torch.meshgrid(torch.arange(camera.height) + 0.5, torch.arange(camera.width) + 0.5, indexing="ij")
     dx, dy = (at - mean[:, None, None] for at, mean in zip((x, y), projected.means.T, strict=True))
@@ -123,10 +123,10 @@ def alphas(projected: Projected, camera: Camera) -> Tensor:
     return shown[:, None, None] * (-0.5 * (a * dx * dx + 2 * b * dx * dy + c * dy * dy)).exp()
 
 
-def certain(projected: Projected, camera: Camera, margin: float) -> Tensor:
+def certain(projected: ProjectedGaussians, camera: Camera, margin: float) -> Tensor:
     """Pixels where no Gaussian's alpha lies so close to a bound that rounding could take it over, ``[H, W]``."""
     found = alphas(projected, camera).detach()
-    return ((found / LEAST - 1).abs() > margin).all(0) & ((found / MOST - 1).abs() > margin).all(0)
+    return ((found / MIN_ALPHA - 1).abs() > margin).all(0) & ((found / MAX_ALPHA - 1).abs() > margin).all(0)
 
 
 SETTINGS = {

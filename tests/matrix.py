@@ -52,7 +52,7 @@ LEFT_OUT = {
 }
 """Slow tests, and what they are, for ``make test`` alone."""
 TRAINING = [f"tests/{name}" for name in (
-    "callbacks", "gpu/test_replay.py", "runs/test_processes.py", "runs/test_resume.py", "runs/test_train.py",
+    "callbacks", "runs/test_processes.py", "runs/test_resume.py", "runs/test_train.py",
     "test_other_device.py",
 )]  # fmt: skip
 """More tests that train, for the setting that changes the order of sums."""

@@ -211,12 +211,6 @@ def yaml_tree(data: bytes, random: Random) -> bytes:
     return text.encode("utf-8", "surrogatepass")
 
 
-LAUGHS = "\n".join(
-    ["a0: &a0 [x, x, x, x, x, x, x, x, x]", *(f"a{i}: &a{i} [{f'*a{i - 1}, ' * 9}]" for i in range(1, 12))]
-)
-"""A few lines of YAML whose aliases stand for gigabytes."""
-
-
 def put(file: Path, key: str, value: object) -> None:
     """Change a value of a YAML file, of a dotted key, as a text editor would."""
     content = yaml.safe_load(file.read_text())
@@ -239,8 +233,6 @@ def yaml_text(data: bytes, random: Random) -> bytes:
         )
     )  # fmt: skip
     lines = data.decode().splitlines()
-    if random.random() < 0.2:
-        return "\n".join([LAUGHS, *lines]).encode()
     at = random.randrange(len(lines))
     lines[at] = f"{lines[at].partition(':')[0]}: {odd}"
     return "\n".join(lines).encode()

@@ -6,11 +6,13 @@ import subprocess
 import sys
 import threading
 import warnings
+from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
 import yaml
 from faults import scores
+from hydra._internal.hydra import Hydra
 from hydra.core.global_hydra import GlobalHydra
 
 from ctm_plugin import __version__
@@ -59,16 +61,47 @@ def test_a_plugin_is_a_choice_with_its_defaults(small, monkeypatch):
 
 def test_nothing_of_the_process_is_changed(small, untrained, monkeypatch):
     monkeypatch.setattr(sys, "argv", ["pytest", "seed=-5"])
-    for full in ("0", None):
-        monkeypatch.setenv("HYDRA_FULL_ERROR", full) if full else monkeypatch.delenv("HYDRA_FULL_ERROR")
-        before = dict(os.environ)
-        assert main(["backbone=nerve"]) == 1
-        assert main([*small, "ctm.k=0"]) == 1
-        with pytest.raises(AssertionError, match="training has begun"):
-            main([*small])
-        assert dict(os.environ) == before
-        assert sys.argv == ["pytest", "seed=-5"]
-        assert not GlobalHydra.instance().is_initialized()
+    before = dict(os.environ)
+    assert main(["backbone=nerve"]) == 1
+    assert main([*small, "ctm.k=0"]) == 1
+    with pytest.raises(AssertionError, match="training has begun"):
+        main([*small])
+    assert dict(os.environ) == before
+    assert sys.argv == ["pytest", "seed=-5"]
+    assert not GlobalHydra.instance().is_initialized()
+
+
+@pytest.mark.parametrize("more", [(), ("--cfg", "job")])
+def test_one_run_is_composed_once(small, untrained, monkeypatch, more):
+    """Geometry and budget are found in what was composed."""
+    made, own = [], Hydra.compose_config
+
+    def compose_config(*args, **named):
+        made.append(named["overrides"])
+        return own(*args, **named)
+
+    monkeypatch.setattr(Hydra, "compose_config", compose_config)
+    arguments = [each for each in small if not each.startswith("trainer=")]
+    with nullcontext() if more else pytest.raises(AssertionError, match="training has begun"):
+        assert main([*arguments, *more]) == 0
+    assert len(made) == 1
+
+
+def test_what_hydra_prints(small, capsys):
+    assert main(["--cfg", "job", "-p", "backbone", *small[:2], "--resolve"]) == 0
+    printed = capsys.readouterr()
+    heading, _, text = printed.out.partition("\n")
+    assert heading == "# @package backbone"
+    assert yaml.safe_load(text)["grow"] == [100, 200, 300]  # of the quick budget, which was found
+    assert "trainer=quick: small pictures, and no GPU\n" in printed.err
+    assert main(["--cfg", "hydra", "-p", "hydra.run"]) == 0
+    assert capsys.readouterr().out.startswith("# @package hydra.run\ndir: runs/${scene:}_")
+    assert main(["--cfg", "all", "-p", "hydra.job.name"]) == 0
+    assert capsys.readouterr().out == "cli\n"
+
+
+def test_choices_in_a_folder_that_is_not_there(refused):
+    assert "--config-dir: found 'nowhere', expected a folder with choices" in refused("-cd", "nowhere")
 
 
 def test_arguments_come_from_the_command_line(monkeypatch, capsys):
@@ -97,7 +130,7 @@ def test_every_failed_job_of_a_sweep_is_told_and_the_others_run(small, capsys):
 def test_ctrl_c_ends_a_sweep(small, monkeypatch, capsys):
     begun = []
 
-    def train(config, run, tell):
+    def train(config, run, *_):
         begun.append(run)
         raise Interrupted("after step 3", run)
 

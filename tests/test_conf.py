@@ -306,7 +306,7 @@ def test_an_experiment_of_the_users(composed, experiment):
 
 def test_an_experiment_through_the_command_line(experiment, monkeypatch, tmp_path):
     seen = []
-    monkeypatch.setattr("ctm_plugin.runs.train.train", lambda config, run, tell: seen.append(config) or {})
+    monkeypatch.setattr("ctm_plugin.runs.train.train", lambda config, *_: seen.append(config) or {})
     monkeypatch.chdir(tmp_path)
     assert cli.main(["--config-dir", str(experiment), "+experiment=small", "ctm=off"]) == 0
     assert (seen[0]["ctm"]["preset"], seen[0]["seed"], seen[0]["trainer"]["budget"]) == ("off", 7, "smoke")

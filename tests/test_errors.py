@@ -4,7 +4,7 @@ import signal
 
 import pytest
 
-from ctm_plugin.errors import LONGEST, ConfigError, DataError, UnknownNameError, held_interrupt
+from ctm_plugin.errors import MAX_CHARACTERS, ConfigError, DataError, UnknownNameError, held_interrupt
 
 
 def test_control_characters_are_escaped():
@@ -19,7 +19,7 @@ def test_what_is_long_is_cut():
         ConfigError("k", [0] * 5000, "e"),
         UnknownNameError("k", "x" * 5000, ["n"]),
     ):
-        assert len(str(error)) < 2 * LONGEST + 100
+        assert len(str(error)) < 2 * MAX_CHARACTERS + 100
         assert "..." in str(error)
 
 

@@ -1,8 +1,10 @@
 """``import ctm_plugin as ctm`` in a program that trains by itself."""
 
+import re
 import subprocess
 import sys
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
@@ -10,7 +12,7 @@ import torch
 import ctm_plugin as ctm
 from ctm_plugin.backbones.nerf import NeRF
 from ctm_plugin.errors import ConfigError, CTMError
-from ctm_plugin.scene.poses import STILL
+from ctm_plugin.scene.poses import IDENTITY
 
 
 def test_it_takes_no_torch_until_asked():
@@ -71,7 +73,7 @@ def test_what_cannot_be_used_is_refused():
 
 def test_a_run_is_looked_at_from_any_camera(splat_run):
     run = ctm.load_run(splat_run)
-    views, world = run.module.scene.test, run.module.scene.world or STILL
+    views, world = run.module.scene.test, run.module.scene.world or IDENTITY
     (pose,), lens = world.inverse().of_poses(views.c2w[:1].double().numpy()), views.intrinsics[0].tolist()
     seen = run.render(pose, lens, views.width, views.height, kind="rgb")
     with torch.no_grad():
@@ -79,7 +81,51 @@ def test_a_run_is_looked_at_from_any_camera(splat_run):
     torch.testing.assert_close(seen, expected, atol=1e-3, rtol=0)
     assert torch.equal(run.render(pose, lens, views.width, views.height), run.light.apply(seen))
     shown = run.gaussians()
-    assert shown.base.shape == shown.means.shape == run.module.gaussians.means.shape
+    assert shown.sh0.shape == shown.means.shape == run.module.gaussians.means.shape
     other = replace(run, parts=replace(run.parts, backbone=NeRF.__new__(NeRF)))
     with pytest.raises(CTMError, match="found a run of NeRF, expected one of splats"):
         other.gaussians()
+
+
+def test_the_page_s_lines_train_splats_in_the_loop_of_gsplat_s_own_trainer():
+    """A rasteriser of flat Gaussians, an Adam for each of their tables, a scheduler: ``examples/simple_trainer.py``."""
+    page = Path(__file__).parents[1].joinpath("docs/plug_in.md").read_text(encoding="utf-8")
+    first, fitting, comparing, decoding = re.search(
+        r"## A trainer of your own.*?```python\n(.*?)```", page, re.S
+    )[1].splitlines()  # fmt: skip
+    torch.manual_seed(0)
+    axis, max_steps = torch.linspace(0, 1, 24), 150
+    pixels = torch.stack(torch.meshgrid(axis, axis, indexing="xy"), dim=-1).flatten(0, 1)
+    dark = 0.04 * torch.stack([pixels[:, 0], pixels[:, 1], (6 * pixels[:, 0]).sin() ** 2], dim=-1)
+    here = {"ctm": ctm, "colors": dark.repeat(9, 1), "rays": pixels, "rgb": dark}
+    exec(f"{first}\n{fitting}", here)
+    sizes = {"means": (64, 2), "scales": (64, 1), "opacities": (64, 1), "colors": (64, here["transform"].channels)}
+    splats = torch.nn.ParameterDict({name: torch.rand(size) for name, size in sizes.items()})
+    rates = {"means": 1e-3, "scales": 5e-3, "opacities": 5e-2, "colors": 2e-2}
+    optimizers = {
+        name: torch.optim.Adam([{"params": splats[name], "lr": rate, "name": name}], eps=1e-15)
+        for name, rate in rates.items()
+    }
+    schedulers = [torch.optim.lr_scheduler.ExponentialLR(optimizers["means"], gamma=0.01 ** (1 / max_steps))]
+
+    def rasterization(at: torch.Tensor) -> torch.Tensor:
+        away = torch.cdist(at, splats["means"]) / (0.1 * splats["scales"].exp().T)
+        alphas = splats["opacities"].sigmoid().T * (-0.5 * away**2).exp()
+        left = torch.cat([torch.ones(len(at), 1), (1 - alphas).cumprod(dim=1)[:, :-1]], dim=1)
+        return (alphas * left) @ splats["colors"].sigmoid()
+
+    here["field"] = rasterization
+    errors = []
+    for _ in range(max_steps):
+        exec(comparing, here)
+        here["loss"].backward()
+        for optimizer in [*optimizers.values(), here["adam"]]:
+            optimizer.step()
+            optimizer.zero_grad(set_to_none=True)
+        for scheduler in schedulers:
+            scheduler.step()
+        with torch.no_grad():
+            exec(decoding, here)
+            errors.append(float((here["picture"] - dark).square().mean()))
+    assert here["picture"].shape == dark.shape
+    assert errors[-1] < errors[0] / 10

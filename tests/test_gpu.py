@@ -16,7 +16,6 @@ from ctm_plugin.errors import Interrupted
 from ctm_plugin.gpu import trial
 from ctm_plugin.optim import grid_adam
 from ctm_plugin.rays import hash_density, occupancy
-from ctm_plugin.rays.packing import WATCHED
 from ctm_plugin.runs.assemble import assemble
 from ctm_plugin.runs.evaluate import evaluate
 from ctm_plugin.runs.train import resume, train
@@ -58,47 +57,6 @@ def test_the_kernels(name):
         assert trial.tried(name, lambda: kernel, reference, torch.device("cuda")) is kernel
 
 
-REPLAYED = ["dvgo", "nerf", "ngp"]
-
-
-@pytest.mark.parametrize("name", REPLAYED)
-def test_steps_are_replayed(name, configuration, monkeypatch):
-    """With the loss and gradients that one operator at a time finds; nothing is waited for."""
-    monkeypatch.undo()  # the GPU draws its own numbers
-    parts = assemble(configuration(name, "ctm=on", "trainer.replay=true"))
-    side = Side(parts.backbone.to("cuda"), parts.attach, False)
-    for _ in range(WATCHED + 2):
-        side.step()
-    module = side.module
-    assert module.replay.recorded is not None
-    torch.cuda.set_sync_debug_mode("error")
-    try:
-        side.step()
-    finally:
-        torch.cuda.set_sync_debug_mode("default")
-    found = []
-    for left in (1, 0):
-        module.batches_seen, module.replay.left = 100, left
-        side.optimizers.zero_grad()
-        loss = module.training_step(None, 0)["loss"]
-        loss.backward()
-        found.append([loss.detach(), *(each.grad for each in module.parameters() if each.grad is not None)])
-    for replayed, plain in zip(*found, strict=True):
-        assert (replayed - plain).norm() <= 1e-3 * plain.norm()
-
-
-@pytest.mark.parametrize("precision", ["32-true", "auto"])
-@pytest.mark.parametrize("name", REPLAYED)
-def test_a_whole_run_is_replayed(name, precision, configuration, tmp_path):
-    """To what it comes to one operator at a time, but for rounding."""
-    brief = *BRIEF, f"trainer.precision={precision}", "trainer.accelerator=auto"
-    found = [
-        train(configuration(name, *brief, f"trainer.replay={given}"), tmp_path / given)["psnr"]
-        for given in ("true", "false")
-    ]
-    assert found[0] == pytest.approx(found[1], abs=0.1 if precision == "32-true" else 0.5)
-
-
 @pytest.mark.parametrize("precision", ["32-true", "auto"])
 @pytest.mark.parametrize("name", SETTINGS)
 def test_a_whole_run(name, precision, configuration, tmp_path):
@@ -120,7 +78,7 @@ def test_the_gradients_of_a_step(name, configuration):
     found = []
     for device in ("cpu", "cuda"):
         parts = assemble(configuration(name, "ctm=on"))
-        module = Side(parts.backbone.to(device), parts.attach, False).module
+        module = Side(parts.backbone.to(device), False).module
         module.training_step(None, 0)["loss"].backward()
         found.append({name: each.grad for name, each in module.named_parameters() if each.grad is not None})
     ours, theirs = found
@@ -140,7 +98,7 @@ PLANAR_WAITS = 6
 def test_what_a_step_waits_for(name, configuration, monkeypatch):
     monkeypatch.undo()  # the GPU draws its own numbers
     parts = assemble(configuration(name, "ctm=on"))
-    side = Side(parts.backbone.to("cuda"), parts.attach, False)
+    side = Side(parts.backbone.to("cuda"), False)
     side.step()
     torch.cuda.set_sync_debug_mode("warn")
     try:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from ctm_plugin.cli import USUAL, main
+from ctm_plugin.cli import MAIN_GROUPS, main
 from ctm_plugin.settings import registry
 
 MISTAKES = [
@@ -177,7 +177,7 @@ def test_typos_and_help_are_told_before_torch_is_imported(tmp_path):
         f"{m}?" for m in lines.values()
     ]
     assert done.stdout.splitlines()[-1] == "False"
-    assert all(f"\n{group}=" in done.stdout for group in USUAL)
+    assert all(f"\n{group}=" in done.stdout for group in MAIN_GROUPS)
 
 
 def test_a_long_message_of_hydra_s_is_cut(capsys):

@@ -106,7 +106,7 @@ def test_an_interrupted_run_goes_on(name, steps, whole, tmp_path, monkeypatch, c
 @pytest.mark.parametrize(("name", "expected"), STEP_WAITS.items())
 def test_what_a_step_waits_for(name, expected, configuration, there):
     parts = assemble(configuration(name, "ctm=on"))
-    side = subject.Side(parts.backbone.to(DEVICE), parts.attach, False)
+    side = subject.Side(parts.backbone.to(DEVICE), False)
     waits.clear()
     side.step()
     assert waits == expected

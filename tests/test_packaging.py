@@ -67,17 +67,19 @@ def plugged_in(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.slow
 def test_packages_of_others(plugged_in, tmp_path):
-    """A backbone, colours, a learned transform, a verb: trained, scored, listed; one process, as imports take long."""
+    """A backbone, colours, a transform, an appearance, a verb: trained, scored, listed in one process."""
     small = ["trainer=smoke", "backbone=tiny", "backbone.steps=4", "dataset.downscale=8", "dataset.skip=10"]
-    chosen = {"off": ["ctm=off", "color_space=equalize"], "flow": ["ctm=flow", "color_space=whiten"]}
+    flow = ["ctm=flow", "color_space=whiten", "appearance=affine"]
+    chosen = {"off": ["ctm=off", "color_space=equalize"], "flow": flow}
     lines = [[*small, *given, f"hydra.run.dir={name}"] for name, given in chosen.items()]
     lines += [["evaluate", "flow"], ["list"], ["--help"], ["scenes", "--help"]]
     asked = f"from ctm_plugin.cli import main; from ctm_scenes.spec import SCENES; import sys; n = {lines}\n"
     asked += "code = max(main(each) for each in n); print(*(SCENES.get(name).name for name in SCENES.names()))\n"
     *listed, scenes = python("-c", f"{asked}sys.exit(code)", cwd=tmp_path, path=plugged_in).splitlines()
     found = {name: json.loads((tmp_path / name / "metrics.json").read_text()) for name in chosen}
-    for ctm, (_, space) in chosen.items():
+    for ctm, (_, space, *_) in chosen.items():
         assert [found[ctm][key] for key in ("backbone", "ctm", "color_space")] == ["tiny", ctm, space.partition("=")[2]]
+    assert found["flow"]["appearance"] == "affine"
     again = json.loads((tmp_path / "flow" / "evaluation" / "metrics.json").read_text())
     assert again["psnr"] == found["flow"]["psnr"]
     assert all(name in "\n".join(listed) for name in ("asinh", "equalize", "gamma", "linear_log", "whiten"))

@@ -16,12 +16,12 @@ from ctm_plugin.errors import ConfigError
 from ctm_plugin.optim.schedules import Schedule, exponential
 from ctm_plugin.scene.views import Views, unit
 
-DARKEST = 1e-6
-"""Mean linear light that a picture has at least, where exposures start from it."""
+MIN_MEAN_LIGHT = 1e-6
+"""Least mean linear light of a picture from which its initial exposure is taken."""
 
 
-class Place(NamedTuple):
-    """Where on which pictures some pixels lie, and what is there."""
+class PixelPlaces(NamedTuple):
+    """Places of R pixels in training pictures, and the colours rendered there."""
 
     view: Int[Tensor, " r"]
     """The number of the training picture."""
@@ -60,11 +60,11 @@ class Exposure(nn.Module):
         """Natural logarithms of all pictures' gains; their mean is 0."""
         return self.log_gain - self.log_gain.mean()
 
-    def forward(self, light: Float[Tensor, "r 3"], place: Place) -> Float[Tensor, "r 3"]:
+    def forward(self, light: Float[Tensor, "r 3"], place: PixelPlaces) -> Float[Tensor, "r 3"]:
         """Linear light of the field as the pictures recorded it, before it is clipped."""
         return light * self.log_gains().exp().index_select(0, place.view)[:, None]
 
-    def undone(self, light: Float[Tensor, "r 3"], place: Place) -> Float[Tensor, "r 3"]:
+    def undone(self, light: Float[Tensor, "r 3"], place: PixelPlaces) -> Float[Tensor, "r 3"]:
         """Linear light of the pictures as the field has it: the inverse."""
         return light / self.log_gains().exp().index_select(0, place.view)[:, None]
 
@@ -101,14 +101,14 @@ def log_exposures(start: str, views: Views) -> Float[Tensor, " n"]:
     if start == "same":
         return torch.zeros(len(views))
     if start == "exif":
-        told = torch.full((len(views),), torch.nan) if views.exposures is None else views.exposures
-        if silent := [name for name, missing in zip(views.names, told.isnan().tolist(), strict=True) if missing]:
+        exposures = torch.full((len(views),), torch.nan) if views.exposures is None else views.exposures
+        if silent := [name for name, missing in zip(views.names, exposures.isnan().tolist(), strict=True) if missing]:
             expected = f"pictures whose EXIF has an exposure time: {len(silent)} of {len(views)} have none"
             raise ConfigError("appearance.start", start, f"{expected}, as {silent[0]}")
-        return told.log()
+        return exposures.log()
     means = []
     for index, image in enumerate(views.images):
         pixels = image if views.mask is None else image[views.mask[index]]
         pixels = pixels[pixels[..., 3] > 0] if views.has_alpha else pixels
-        means.append(srgb_to_linear(unit(pixels[..., :3])).mean() if len(pixels) else torch.tensor(DARKEST))
-    return torch.stack(means).float().cpu().clamp(min=DARKEST).log()
+        means.append(srgb_to_linear(unit(pixels[..., :3])).mean() if len(pixels) else torch.tensor(MIN_MEAN_LIGHT))
+    return torch.stack(means).float().cpu().clamp(min=MIN_MEAN_LIGHT).log()

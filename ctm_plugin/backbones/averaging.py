@@ -9,16 +9,16 @@ from typing import Any
 import torch
 from torch import nn
 
-EVERY = 4
-"""Steps from one look at the parameters to the next."""
-REACH = 8
-"""The mean begins so many times the latest steps before the end: of what was before them nothing would be left."""
+STEPS_BETWEEN = 4
+"""Optimizer steps from one update of the mean to the next."""
+WINDOWS = 8
+"""The mean starts this many averaging windows before the end: older parameters would weigh nothing."""
 
 
 def share(count: int, latest: int) -> float:
     """What of the mean the parameters make up at its look number ``count``: ``max(4 / latest, 9 / (10 + count))``, by
     which the beginning is soon forgotten."""
-    return max(min(1.0, EVERY / latest), 9 / (10 + count))
+    return max(min(1.0, STEPS_BETWEEN / latest), 9 / (10 + count))
 
 
 @torch.no_grad()
@@ -39,7 +39,7 @@ class Averaging:
     field: nn.Module
     mean_field: nn.Module | None
     settled = 0
-    """From which step on the field has the size of the end."""
+    """First step at which the field has its final size."""
 
     @property
     def pictured_field(self) -> nn.Module:
@@ -54,7 +54,7 @@ class Averaging:
     def average(self, step: int) -> None:
         """Take the parameters before a step into their mean, if it is one of the looks."""
         averaged = self.config.averaged
-        count, rest = divmod(step - max(self.settled, self.total_steps - REACH * averaged), EVERY)
+        count, rest = divmod(step - max(self.settled, self.total_steps - WINDOWS * averaged), STEPS_BETWEEN)
         if count < 0 or rest:
             return
         if count == 0 or self.mean_field is None:

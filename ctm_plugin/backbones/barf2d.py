@@ -18,6 +18,7 @@ from ctm_plugin.backbones.neural_image import NeuralImage, shown_frequencies
 from ctm_plugin.backbones.settings import BARF2DConfig
 from ctm_plugin.color.light import Light, chosen_light, enhancement_gain, find_light
 from ctm_plugin.color.photometric import Photometric
+from ctm_plugin.color.transform import ColorTransform
 from ctm_plugin.draws import Draws, seeded
 from ctm_plugin.errors import ConfigError
 from ctm_plugin.metrics.evaluate import Scoring, summarize_alignment
@@ -29,9 +30,10 @@ from ctm_plugin.show.outlines import outlines
 from ctm_plugin.show.pictures import below, beside, latent_picture, write_png
 from ctm_plugin.show.snapshot import Snapshot, compared
 
-SHIFT = 2
-"""Parameters of a homography that move a patch, the first ones."""
+TRANSLATION = 2
+"""Number of a homography's parameters that translate a patch; they come first."""
 EVAL_CHUNK = 1 << 16
+"""Pixels rendered at once outside training."""
 
 
 @dataclass
@@ -53,7 +55,7 @@ class BARF2D(Backbone):
     Args:
         config: sizes, steps, rates.
         scene: a picture's patches.
-        channels, photometric, seed: see :class:`~ctm_plugin.backbones.base.Backbone`.
+        transform, photometric, seed: see :class:`~ctm_plugin.backbones.base.Backbone`.
     """
 
     Config = BARF2DConfig
@@ -63,11 +65,11 @@ class BARF2D(Backbone):
         self,
         config: BARF2DConfig,
         scene: PlanarScene,
-        channels: int = 3,
+        transform: ColorTransform | None = None,
         photometric: Photometric | None = None,
         seed: int = 0,
     ):
-        super().__init__(channels, photometric, seed)
+        super().__init__(transform, photometric, seed)
         self.config, self.scene = config, scene
         self.total_steps = config.steps
         count, each = len(scene.patches), scene.patch**2
@@ -80,7 +82,7 @@ class BARF2D(Backbone):
         self.register_buffer("grid", grid, persistent=False)
         frequencies = 0 if config.encoding == "none" else config.frequencies
         with seeded(seed):
-            self.image = NeuralImage(channels, config.width, config.depth, frequencies, config.encoding == "barf")
+            self.image = NeuralImage(self.channels, config.width, config.depth, frequencies, config.encoding == "barf")
         self.moved = nn.Parameter(torch.zeros(count - 1, 8))
         self.progress = 0.0
 
@@ -89,7 +91,7 @@ class BARF2D(Backbone):
         """Give the parameters ``[5, 8]`` of the homographies, the first 0."""
         moved = self.moved
         if self.progress < self.config.shifts_until:  # what has no gradient rests where it began
-            moved = torch.cat([moved[:, :SHIFT], moved[:, SHIFT:].detach()], dim=1)
+            moved = torch.cat([moved[:, :TRANSLATION], moved[:, TRANSLATION:].detach()], dim=1)
         return torch.cat([torch.zeros_like(moved[:1]), moved])
 
     # Training.
@@ -142,7 +144,7 @@ class BARF2D(Backbone):
     def decay_warps(self) -> None:
         """Draw all of the homographies but their shifts towards 0, ``h (1 - lr decay)``, while frequencies come in."""
         if self.progress < self.config.end:
-            self.moved[:, SHIFT:] *= 1 - self.config.lr_warp * self.config.warp_decay
+            self.moved[:, TRANSLATION:] *= 1 - self.config.lr_warp * self.config.warp_decay
 
     def stats(self) -> dict[str, float]:
         error = (self.warps.detach() - self.scene.true_warps.to(self.device)).norm(dim=-1).mean()
@@ -176,8 +178,8 @@ class BARF2D(Backbone):
         """What pictures of the scene are shown to people in: found from the patches as trained on."""
         return find_light(self.scene.patches)
 
-    def scores(self, folder: Path, scoring: Scoring) -> dict[str, Any]:
-        """Score the homographies and the patches; write the pictures of :meth:`pictures` into ``folder``.
+    def scores(self, folder: Path | None, scoring: Scoring) -> dict[str, Any]:
+        """Score the homographies and the patches; write :meth:`pictures` into ``folder``, unless that is ``None``.
 
         Returns:
             See :func:`ctm_plugin.metrics.evaluate.summarize_alignment`, with ``protocol``.
@@ -185,7 +187,7 @@ class BARF2D(Backbone):
         self.eval()
         scene = self.scene
         with full_float32(self.device):
-            found = Alignment(
+            alignment = Alignment(
                 rendered=self.decode(self.render_patches()).float().cpu(),
                 clean=scene.clean,
                 fused=self.decode(self.render_image()).float().cpu(),
@@ -194,9 +196,9 @@ class BARF2D(Backbone):
                 true_warps=scene.true_warps,
                 gain=enhancement_gain(list(scene.clean), scene.exposure),
             )
-            for name, picture in self.pictures(chosen_light(scoring.light, self.light)).items():
+            for name, picture in self.pictures(chosen_light(scoring.light, self.light)).items() if folder else ():
                 write_png(folder / "lit" / f"{name}.png", picture)
-            result = summarize_alignment(found)
+            result = summarize_alignment(alignment)
         protocol = (
             f"{scene.name}, 5 patches of {scene.patch}x{scene.patch} out of {scene.width}x{scene.height}, "
             f"exposure {scene.exposure:g}, float RGB clipped to [0, 1]"
@@ -217,7 +219,7 @@ class BARF2D(Backbone):
             "latent": latent_picture(latent),
         }
 
-    def snapshot(self) -> Snapshot:
+    def snapshot(self, view: int) -> Snapshot:
         """Show the picture under alignment (:func:`ctm_plugin.show.snapshot.compared`), and ``test/warps``."""
         scene, light = self.scene, self.light
         every = self.stride(scene.height, scene.width)

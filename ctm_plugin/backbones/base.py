@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import gc
 import math
-from collections.abc import Callable, Hashable
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -17,29 +16,30 @@ from lightning.pytorch.strategies import DDPStrategy
 from torch import Tensor
 from torch.optim import Optimizer
 from torch.profiler import record_function
+from torch.utils.data import DataLoader
 
 from ctm_plugin.appearance.exposure import Exposure
+from ctm_plugin.backbones.untouched import snapshot
 from ctm_plugin.color.light import AS_IS, Light
 from ctm_plugin.color.photometric import Photometric
+from ctm_plugin.color.prepare import SAMPLE_COLORS, adam_of, prepare
 from ctm_plugin.color.spaces.rgb import Space as RGB
 from ctm_plugin.color.transform import ColorTransform, Uniform
 from ctm_plugin.draws import Draws
-from ctm_plugin.gpu.replay import Replay, Step
 from ctm_plugin.metrics.evaluate import Scoring
+from ctm_plugin.metrics.table import METRICS
 from ctm_plugin.optim.named_optimizers import NamedOptimizers, leave_out
 from ctm_plugin.optim.pace import Pace
-from ctm_plugin.optim.schedules import Schedule
+from ctm_plugin.optim.schedules import Schedule, exponential
 from ctm_plugin.show.snapshot import Snapshot
 
-WIDTH = 128
+PREVIEW_WIDTH = 128
 """Largest width in pixels of a picture that is rendered while training."""
-COLORS = 1 << 15
-"""Training colours that are looked at before a field trains."""
-STEPS = 8
-"""Largest number of its pixels, in training steps' rays: between pictures there are hundreds of steps."""
+PREVIEW_STEPS = 8
+"""Most pixels of such a picture, in multiples of ``batch_rays``: between pictures there are hundreds of steps."""
 
-ENDLESS = 1 << 40
-"""Steps, more than any training has."""
+UNLIMITED_STEPS = 1 << 40
+"""Step limit of a training that a clock ends."""
 
 
 @dataclass
@@ -79,11 +79,10 @@ class Backbone(L.LightningModule):
     A subclass gives ``total_steps``, ``draw``, ``scene_colors``, ``predict``, ``field_optimizers`` and, if it has
     any, ``regularisers``, ``field_schedule`` and ``color_biases``; its ``Config`` dataclass is the backbone's part of
     the configuration. What it is scored by, shows and films is its own: ``scores``, ``snapshot``, ``film``.
-    The transform is the identity until :class:`ctm_plugin.callbacks.attach_ctm.AttachTransform` puts one there;
     ``appearance`` is what tells the training pictures apart, ``None`` where nothing does.
 
     Args:
-        channels: k, how many channels to render.
+        transform: whose latents it renders; ``None``: the identity.
         photometric: the distance between colours.
         seed: of all random numbers of the training.
     """
@@ -99,27 +98,26 @@ class Backbone(L.LightningModule):
     """Whether its ``scene`` is a :class:`~ctm_plugin.scene.views.Scene` that it renders from any camera, as a
     :class:`~ctm_plugin.backbones.posed.PosedBackbone` does."""
     light: Light = AS_IS
-    """What its pictures are shown to people in."""
-    replayed: bool = False
-    """Whether a GPU may record its steps: not by default, until ``tests/test_gpu.py`` has passed on a card."""
+    """Light in which its pictures are displayed."""
     loops_only: bool = False
     """Whether on a CPU loops do the work of its steps, so that torch's operators are as quick on one thread."""
+    snapshots: Sequence[int] = (0,)
+    """Numbers of the test views that :meth:`snapshot` shows."""
     total_steps: int
     """Optimizer steps of a whole training."""
     pace: Pace | None = None
-    """How its schedule is spread over the steps, of backbones whose trainings may end earlier or later."""
+    """Spread of its schedule over the steps, for backbones whose trainings may end earlier or later."""
 
-    def __init__(self, channels: int = 3, photometric: Photometric | None = None, seed: int = 0):
+    def __init__(
+        self, transform: ColorTransform | None = None, photometric: Photometric | None = None, seed: int = 0
+    ):  # fmt: skip
         super().__init__()
-        self.channels = channels
-        self.transform: ColorTransform = RGB()
+        self.transform: ColorTransform = RGB() if transform is None else transform
         self.appearance: Exposure | None = None
         self.photometric = photometric or Photometric()
         self.seed = seed
         self.batches_seen = 0
         self.terms: dict[str, Tensor] = {}
-        self.replay = Replay()
-        self.transform_optimizer: Callable[[ColorTransform], tuple[Optimizer, Schedule]] | None = None
 
     # What a backbone gives.
 
@@ -132,8 +130,8 @@ class Backbone(L.LightningModule):
         raise NotImplementedError
 
     def some_colors(self) -> Tensor:
-        """``[COLORS, 3]`` of them, the same each time."""
-        return self.scene_colors(Draws(self.seed, 0, self.device, stream="colors"), COLORS)
+        """``[SAMPLE_COLORS, 3]`` of them, the same each time."""
+        return self.scene_colors(Draws(self.seed, 0, self.device, stream="colors"), SAMPLE_COLORS)
 
     def predict(self, batch: Batch, draws: Draws) -> Rendering:
         """Render the batch's pixels, for training."""
@@ -162,16 +160,16 @@ class Backbone(L.LightningModule):
         """Numbers worth a curve, such as the occupied fraction of a grid."""
         return {}
 
-    def scores(self, folder: Path, scoring: Scoring) -> dict[str, Any]:
-        """Scores of the trained backbone, for ``metrics.json``, and its pictures in ``folder``.
+    def scores(self, folder: Path | None, scoring: Scoring) -> dict[str, Any]:
+        """Scores of the trained backbone, for ``metrics.json``, and its pictures in ``folder``, where there is one.
 
         ``psnr`` is what sweeps that search maximise, ``converged`` false prints "not converged", runs without the same
         ``protocol`` do not share a table.
         """
         return {}
 
-    def snapshot(self) -> Snapshot:
-        """Render one small picture next to its target; called in evaluation mode, without gradients."""
+    def snapshot(self, view: int) -> Snapshot:
+        """Render a test view, small, next to its target; called in evaluation mode, without gradients."""
         return Snapshot()
 
     def film(self) -> Float[Tensor, "h w 3"] | None:
@@ -187,6 +185,11 @@ class Backbone(L.LightningModule):
         return (last - first) * self.batch_rays
 
     # What it gets.
+
+    @property
+    def channels(self) -> int:
+        """How many numbers k it renders in place of a colour."""
+        return self.transform.channels
 
     def compare(self, batch: Batch, latents: list[Tensor], uniform: Uniform) -> Compared:
         """Hold renderings ``[R, k]`` of a batch against its training colours."""
@@ -208,8 +211,8 @@ class Backbone(L.LightningModule):
         return self.batches_seen % self.trainer.accumulate_grad_batches == 0
 
     def stride(self, height: int, width: int) -> int:
-        """Of which rows and columns a picture is rendered while training: of every first, second, third, ..."""
-        return math.ceil(max(width / WIDTH, (width * height / (STEPS * self.batch_rays)) ** 0.5))
+        """Rows and columns from one rendered pixel to the next, of pictures that are rendered while training."""
+        return math.ceil(max(width / PREVIEW_WIDTH, (width * height / (PREVIEW_STEPS * self.batch_rays)) ** 0.5))
 
     @torch.no_grad()
     def decode(self, latent: Tensor) -> Tensor:
@@ -225,12 +228,6 @@ class Backbone(L.LightningModule):
     def training_step(self, _: Any, batch_idx: int) -> dict[str, Any]:
         draws = self.draws(self.batches_seen)
         self.batches_seen += 1
-        step = self.replay(self, draws) if self.replayed else self.step_of(draws)
-        self.terms = step.terms
-        return {"loss": step.loss, **step.shown}
-
-    def step_of(self, draws: Draws) -> Step:
-        """The losses of a batch, a function of the random numbers and the tensors of the backbone."""
         with record_function("ctm/draw"):
             batch = self.draw(draws)
         with record_function("ctm/field"):
@@ -241,32 +238,16 @@ class Backbone(L.LightningModule):
         with record_function("ctm/loss"):
             terms = terms | self.regularisers(batch, rendering, target)
             loss = sum(terms.values())
-        shown = {"latent": rendering.latent.detach(), "target": target, "rgb": rgb}
-        return Step(loss, {name: term.detach() for name, term in terms.items()}, shown)
-
-    def repeats(self) -> Hashable | None:
-        """What a step depends on besides random numbers and tensors, where a GPU may record it; ``None``: it may not.
-
-        Sizes must stay, nothing may be waited for, and no Python number may change from step to step.
-        """
-        return None
-
-    def fixed_sizes(self) -> AbstractContextManager[None]:
-        """Within it, sizes in a step stay, if ever they can."""
-        return nullcontext()
-
-    @property
-    def known(self) -> bool:
-        """Whether all its parts are this package's: others' may do something else in every step."""
-        return all(type(part).__module__.partition(".")[0] in ("ctm_plugin", "torch") for part in self.modules())
+        self.terms = {name: term.detach() for name, term in terms.items()}
+        return {"loss": loss, "latent": rendering.latent.detach(), "target": target, "rgb": rgb}
 
     def configure_optimizers(self) -> NamedOptimizers:
         members = self.field_optimizers()
         for member in members.values():
             leave_out(member, self._not_the_fields())
         schedules = dict.fromkeys(members, self.field_schedule())
-        if self.transform_optimizer is not None:
-            members["ctm"], schedules["ctm"] = self.transform_optimizer(self.transform)
+        if own := adam_of(self.transform):
+            members["ctm"], schedules["ctm"] = own, exponential(self.transform.learning.lr_decay, self.schedule_steps)
         if self.appearance is not None and (own := self.appearance.optimizer(self.schedule_steps)):
             members["appearance"], schedules["appearance"] = own
         return NamedOptimizers(members, schedules)
@@ -284,10 +265,16 @@ class Backbone(L.LightningModule):
     def named_optimizers(self) -> NamedOptimizers:
         return self.optimizers(use_pl_optimizer=False)
 
+    def on_fit_start(self) -> None:
+        # Before callbacks show what was fitted, when training starts.
+        if self.batches_seen == 0:
+            adam = self.named_optimizers.members.get("ctm")
+            prepare(self.transform, adam, self.scene_colors, self.seed, self.device)
+
     @torch.no_grad()
     def on_train_start(self) -> None:
-        # Callbacks come first: the transform is what it is when the field's training begins. From the mean colour a
-        # dark scene is near; from grey the first steps would drive the sigmoid to where it has no gradient.
+        # From the mean colour a dark scene is near; from grey the first steps would drive the sigmoid to where it has
+        # no gradient.
         if self.batches_seen == 0 and (biases := self.color_biases()):
             mean = self.transform.encode(self.some_colors()).mean(0).logit(eps=1e-3)
             for bias in biases:
@@ -300,10 +287,30 @@ class Backbone(L.LightningModule):
         # For callbacks that read them at the start of a batch, before the hook above, as Lightning's monitor does.
         self.named_optimizers.set_rates(self.scheduled)
 
-    def train_dataloader(self) -> torch.utils.data.DataLoader:
+    def validation_step(self, view: Tensor | int, batch_idx: int) -> Snapshot:
+        """Look at a test view; ``val/psnr`` and the like are what :meth:`snapshot` scores."""
+        seen = snapshot(self, int(view))
+        self.log_dict({f"val/{name}": value for name, value in seen.scores.items()}, batch_size=1, sync_dist=True)
+        return seen
+
+    def test_step(self, batch: Any, batch_idx: int) -> None:
+        """Score all test views as they are: ``test/psnr`` and the like are what :meth:`scores` finds."""
+        scores = {name: value for name, value in self.scores(None, Scoring()).items() if name in METRICS}
+        scores = {f"test/{name}": value for name, value in scores.items() if value is not None}
+        self.log_dict(scores, batch_size=1, sync_dist=True)
+
+    def val_dataloader(self) -> DataLoader:
+        # Of a generator of its own: an iterator else draws from that of the training.
+        return DataLoader(self.snapshots, batch_size=None, generator=torch.Generator())
+
+    def test_dataloader(self) -> DataLoader:
+        """All test views at once."""
+        return DataLoader(range(1), batch_size=None)
+
+    def train_dataloader(self) -> DataLoader:
         """One item a batch, empty: batches are drawn on the module's device by (seed, step)."""
-        steps = self.total_steps if self.pace is None else ENDLESS
-        return torch.utils.data.DataLoader(range(steps * self.trainer.accumulate_grad_batches), batch_size=None)
+        steps = self.total_steps if self.pace is None else UNLIMITED_STEPS
+        return DataLoader(range(steps * self.trainer.accumulate_grad_batches), batch_size=None)
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         checkpoint["batches_seen"] = self.batches_seen
@@ -325,4 +332,4 @@ def rewrap(trainer: L.Trainer) -> None:
     if isinstance(strategy, DDPStrategy) and strategy.model is not strategy.lightning_module:
         strategy.model = strategy.lightning_module
         gc.collect()
-        strategy.model = strategy._setup_model(strategy.lightning_module)
+        strategy.configure_ddp()

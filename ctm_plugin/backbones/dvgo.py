@@ -18,6 +18,7 @@ from ctm_plugin.backbones.settings import DVGO_GEOMETRIES, DVGOConfig
 from ctm_plugin.backbones.spaces import space_of
 from ctm_plugin.backbones.voxels import VoxelField
 from ctm_plugin.color.photometric import Photometric
+from ctm_plugin.color.transform import ColorTransform
 from ctm_plugin.draws import seeded
 from ctm_plugin.errors import ConfigError
 from ctm_plugin.optim.grid_adam import GridAdam
@@ -27,11 +28,12 @@ from ctm_plugin.scene.frustum import view_counts
 from ctm_plugin.scene.views import Scene
 
 NETWORKS = {"bounded": (128, 3, 4), "forward": (64, 3, 0)}
-"""Width, depth and frequencies of the colour network, the paper's; without frequencies it gets the plain direction."""
+"""(width, depth, frequencies) of the paper's colour network by geometry; 0 frequencies: it gets the plain direction."""
 TV_SIDE = 128
-"""Total variation is weighted by the grid's sides over this, as finer grids have smaller differences."""
+"""Voxels a side at which total variation has its set weight; finer grids have smaller differences, so it grows with
+them."""
 BASE_PLANES = 256
-"""Planes of which one has the optical depth ``softplus(raw density)``; fewer planes are as much thicker."""
+"""Number of planes at which one plane's optical depth is ``softplus(raw density)``; fewer planes are thicker."""
 
 
 class DVGO(OccupiedBackbone):
@@ -43,7 +45,7 @@ class DVGO(OccupiedBackbone):
     Args:
         config: sizes, steps, rates.
         scene: whose geometry is the configuration's.
-        channels, photometric, seed: see :class:`~ctm_plugin.backbones.radiance.RadianceBackbone`.
+        transform, photometric, seed: see :class:`~ctm_plugin.backbones.radiance.RadianceBackbone`.
     """
 
     Config = DVGOConfig
@@ -54,17 +56,18 @@ class DVGO(OccupiedBackbone):
     coarse_point, point = 0.1, 0.01
     coarse_views = 3
     coarse_alpha_init, alpha_init = 1e-6, 1e-2
-    coarse_threshold = 1e-7
-    box_threshold = 1e-3
+    coarse_alpha_thre = 1e-7
+    bbox_thre = 1e-3
     box_scale = 1.05
 
     def __init__(
-        self, config: DVGOConfig, scene: Scene, channels: int = 3, photometric: Photometric | None = None, seed: int = 0
-    ):
+        self, config: DVGOConfig, scene: Scene, transform: ColorTransform | None = None,
+        photometric: Photometric | None = None, seed: int = 0,
+    ):  # fmt: skip
         if config.geometry is None and scene.geometry != "bounded":
             expected = f"{' or '.join(DVGO_GEOMETRIES)}, given as a key: {scene.name} is {scene.geometry}"
             raise ConfigError("backbone.geometry", None, expected)
-        super().__init__(config, scene, channels, photometric, seed)
+        super().__init__(config, scene, transform, photometric, seed)
         self.geometry = config.geometry or "bounded"
         coarse = self.wants_coarse()
         self.stage = "coarse" if coarse else "fine"
@@ -74,7 +77,7 @@ class DVGO(OccupiedBackbone):
         self.grown = 0
         self.dropped = 0.0  # from the shift of the raw densities
         with seeded(seed):
-            color = ViewMLP(config.features, channels, *NETWORKS[self.geometry])
+            color = ViewMLP(config.features, self.channels, *NETWORKS[self.geometry])
         self.field = self.make_field(color)
 
     def wants_coarse(self) -> bool:
@@ -89,20 +92,20 @@ class DVGO(OccupiedBackbone):
         where it has grown already.
         """
         coarse, config, space = self.stage == "coarse", self.config, space_of(self.scene, self.geometry, box)
-        shape = shape or (cubic_shape(space.box, config.coarse_voxels) if coarse else self.grown_shape(space.box))
+        shape = shape or (cubic_shape(space.aabb, config.coarse_voxels) if coarse else self.grown_shape(space.aabb))
         if self.geometry == "forward":
             shift, planes = plane_shift(shape[2]), shape[2]
             space.measure = planes / (planes - 1) / BASE_PLANES
         else:
             shift = math.log(1 / (1 - (self.coarse_alpha_init if coarse else self.alpha_init)) - 1)
-            space.measure = voxel_size(space.box, config.coarse_voxels if coarse else config.voxels)
+            space.measure = voxel_size(space.aabb, config.coarse_voxels if coarse else config.voxels)
         return VoxelField(
             space,
             shape,
             self.channels if coarse else config.features,
             color,
             direct=coarse,
-            threshold=self.coarse_threshold if coarse else config.threshold,
+            alpha_thre=self.coarse_alpha_thre if coarse else config.threshold,
             step=config.step_size,
             shift=shift - self.dropped,
         )
@@ -117,7 +120,7 @@ class DVGO(OccupiedBackbone):
         return self.fine_start + max(self.config.grow, default=0)
 
     def world_box(self) -> Tensor:
-        return self.field.grid.box if self.geometry == "bounded" else super().world_box()
+        return self.field.grid.aabb if self.geometry == "bounded" else super().world_box()
 
     # Training.
 
@@ -132,7 +135,7 @@ class DVGO(OccupiedBackbone):
         }
 
     def grid_optimizer(self) -> GridAdam:
-        """Of the present field's tables; in the coarse stage voxels are as fast as many cameras see them."""
+        """Optimizer of the field's tables; in the coarse stage a voxel's rate grows with the cameras that see it."""
         field = self.field
         groups = [{"params": [field.density], "name": "density"}, {"params": [field.features], "name": "features"}]
         if self.stage == "fine":
@@ -149,12 +152,13 @@ class DVGO(OccupiedBackbone):
         steps = self.config.lr_decay_steps or max(self.fine_steps, self.fine_start if coarse else 0)
         return exponential(self.lr_final, steps, start)
 
-    @torch.no_grad()
     def on_fit_start(self) -> None:
+        super().on_fit_start()
         if self.global_step == 0 and self.stage == "coarse":
             self.free_what_floats()
         self.renew_pool()
 
+    @torch.no_grad()
     def free_what_floats(self) -> None:
         """Take coarse voxels that few training views see, or that lie close before a camera, for free.
 
@@ -198,13 +202,13 @@ class DVGO(OccupiedBackbone):
     def _start_fine(self) -> None:
         """Build the fine field in a tight box round what the coarse stage found, outside its free space."""
         coarse = self.field
-        found = (coarse.alpha() > self.box_threshold).flatten()
-        solid = coarse.dilated_alpha() > self.box_threshold
-        if not found.any():
-            told = "the coarse stage found no surface; the fine stage starts in the whole box"
-            warnings.warn(f"{told}: dataset.near and dataset.far may not hold the scene", stacklevel=2)
-            found[:] = solid[:] = True
-        points = coarse.grid.vertices()[found]
+        dense = (coarse.alpha() > self.bbox_thre).flatten()
+        solid = coarse.dilated_alpha() > self.bbox_thre
+        if not dense.any():
+            message = "the coarse stage found no surface; the fine stage starts in the whole box"
+            warnings.warn(f"{message}: dataset.near and dataset.far may not hold the scene", stacklevel=2)
+            dense[:] = solid[:] = True
+        points = coarse.grid.vertices()[dense]
         low, high = points.amin(0), points.amax(0)
         margin = ((high - low) * (self.box_scale - 1) / 2).clamp_min(coarse.grid.voxel)
         self.stage = "fine"
@@ -216,7 +220,7 @@ class DVGO(OccupiedBackbone):
     @torch.no_grad()
     def _grow(self) -> None:
         self.grown += 1
-        old, shape = self.field.grid.shape, self.grown_shape(self.field.grid.box)
+        old, shape = self.field.grid.shape, self.grown_shape(self.field.grid.aabb)
         self.field.resize(shape)
         self.dropped += self.config.shift_drop
         self.field.vertex_shift = self.field.vertex_shift - self.config.shift_drop
@@ -283,25 +287,14 @@ class DVGO(OccupiedBackbone):
             "stage": self.stage,
             "grown": self.grown,
             "dropped": self.dropped,
-            "box": grid.box.cpu(),
+            "box": grid.aabb.cpu(),
             "shape": list(grid.shape),
         }
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         saved = checkpoint["dvgo"]
         self.stage, self.grown, self.dropped = saved["stage"], saved["grown"], saved["dropped"]
-        box, shape = saved["box"], tuple(saved["shape"])
-        rows = len(checkpoint["state_dict"]["field.density"])
-        # What is built must be no larger than what is in the file.
-        if self.stage not in ("coarse", "fine") or not 0 <= self.grown <= len(self.config.grow):
-            raise ValueError(f"stage {self.stage!r}, grown {self.grown!r} times")
-        if not math.isfinite(self.dropped):
-            raise ValueError(f"a shift lowered by {self.dropped}")
-        if len(shape) != 3 or min(shape) < 2 or math.prod(shape) != rows:
-            raise ValueError(f"a table of shape {shape} with {rows} rows")
-        if box.shape != (2, 3) or not box.isfinite().all() or not (box[1] > box[0]).all():
-            raise ValueError(f"a box {box.tolist()}")
-        self.field = self.make_field(self.field.color, box, shape).to(self.device)
+        self.field = self.make_field(self.field.color, saved["box"], tuple(saved["shape"])).to(self.device)
         super().on_load_checkpoint(checkpoint)
 
 

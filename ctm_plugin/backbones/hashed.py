@@ -13,19 +13,18 @@ from ctm_plugin.backbones.spaces import Box
 from ctm_plugin.draws import Draws
 from ctm_plugin.rays.cameras import Rays
 from ctm_plugin.rays.grid import VoxelGrid, cubic_shape
-from ctm_plugin.rays.hash_density import DENSEST, lit, log_density, reach
+from ctm_plugin.rays.hash_density import MAX_LOG_DENSITY, lit, log_density
 from ctm_plugin.rays.hash_grid import HashGrid
 from ctm_plugin.rays.occupancy import dilate, may_meet
-from ctm_plugin.rays.packing import Packing
 
-GEOMETRY = 16
-"""Numbers that the density network hands to the colour network, the density's logarithm first."""
-DECAY = 0.95
-"""What an update of the occupancy leaves of what was known of a cell."""
-CHUNK = 1 << 16
-"""Cells that are looked at in one go."""
-RAYS = 1 << 12
-"""Rays that samples are looked for on in one go."""
+GEOMETRY_FEATURES = 16
+"""Outputs of the density network that the colour network gets; the first is the density's logarithm."""
+OCCUPANCY_DECAY = 0.95
+"""Factor on a cell's stored alpha at each update of the occupancy (instant-ngp)."""
+CELL_CHUNK = 1 << 16
+"""Cells whose density is evaluated at once."""
+RAY_CHUNK = 1 << 12
+"""Rays that are sampled at once."""
 
 
 class HashField(OccupiedField):
@@ -41,18 +40,18 @@ class HashField(OccupiedField):
         channels: of the latent.
         width: of the networks' hidden layers.
         degrees: of the directions' harmonics.
-        threshold: see :class:`OccupiedField`.
+        alpha_thre: see :class:`OccupiedField`.
         free_below: cells with less alpha are free; the mean of all is, where that is less.
     """
 
     def __init__(
         self, space: Box, hash_grid: HashGrid, *, cells: int, channels: int, width: int, degrees: int,
-        threshold: float, free_below: float,
+        alpha_thre: float, free_below: float,
     ):  # fmt: skip
-        super().__init__(space, VoxelGrid(space.box, cubic_shape(space.box, cells)), threshold)
+        super().__init__(space, VoxelGrid(space.aabb, cubic_shape(space.aabb, cells)), alpha_thre)
         self.hash_grid, self.free_below = hash_grid, free_below
-        self.density = DensityMLP(len(hash_grid.sides) * hash_grid.table.shape[1], width, GEOMETRY)
-        self.color = HarmonicMLP(GEOMETRY, channels, width, 3, degrees)
+        self.density = DensityMLP(len(hash_grid.sides) * hash_grid.table.shape[1], width, GEOMETRY_FEATURES)
+        self.color = HarmonicMLP(GEOMETRY_FEATURES, channels, width, 3, degrees)
         self.register_buffer("alpha", torch.zeros(self.grid.count))
         self.register_buffer("allowed", self.occupancy.clone())
         # The occupancy goes on changing: a resumed run draws its rays by what was found when cells last settled.
@@ -64,25 +63,19 @@ class HashField(OccupiedField):
         def shade(index: Tensor, directions: Tensor, ray_index: Tensor) -> Tensor:
             return self.color(*taken(index, out), directions, ray_index)
 
-        return out[:, 0].clamp_max(DENSEST).exp(), shade
+        return out[:, 0].clamp_max(MAX_LOG_DENSITY).exp(), shade
 
     def log_density(self, points: Tensor) -> Tensor:
         """Only the density network's first output, ``[M]``, at points ``[M, 3]`` of the space; without gradients."""
         return log_density(*self._looked_up(), self.space.unit(points))
 
-    def reached(self, t: Tensor, ray_index: Tensor, points: Tensor, packing: Packing) -> tuple[Tensor, ...]:
+    def reached(self, t: Tensor, ray_index: Tensor, points: Tensor, n_rays: int) -> tuple[Tensor, ...]:
         """Samples ``[N]`` of M with alpha that light reaches, and their features: the others change next to nothing."""
         lengths = self.space.lengths(t, points)
         lengths = lengths if isinstance(lengths, Tensor) else t.new_full((1,), lengths)
-        given = *self._looked_up(), self.space.unit(points), lengths, ray_index, packing.rays, self.threshold
-        if packing.places is None:
-            index, features = lit(*given)
-            packing.counts.append(len(index))
-            return *taken(index, t, ray_index, points), features
-        features, mask = reach(*given)
-        index, ray_index = packing.choose(mask, ray_index)
-        t, points, features = taken(index, t, points, features)
-        return t, ray_index, points, features
+        unit = self.space.unit(points)
+        index, features = lit(*self._looked_up(), unit, lengths, ray_index, n_rays, self.alpha_thre)
+        return *taken(index, t, ray_index, points), features
 
     def _looked_up(self) -> tuple[Tensor, Tensor, Tensor, nn.Linear, nn.Linear]:
         grid, layers = self.hash_grid, self.density.layers
@@ -102,13 +95,13 @@ class HashField(OccupiedField):
             cells = torch.cat(cells)
         else:
             cells = torch.arange(count, device=self.alpha.device)
-        low, high = self.space.box
+        low, high = self.space.aabb
         within = (draws.uniform(len(cells), 3) - 0.5) / self.grid.scale
         points = torch.minimum(torch.maximum(self.grid.vertices_at(cells) + within, low), high)
-        self.alpha *= DECAY
+        self.alpha *= OCCUPANCY_DECAY
         longest = self.space.stride / self.space.side
-        for index, part in zip(cells.split(CHUNK), points.split(CHUNK), strict=True):
-            seen = -torch.expm1(-self.log_density(part).clamp_max(DENSEST).exp() * longest)
+        for index, part in zip(cells.split(CELL_CHUNK), points.split(CELL_CHUNK), strict=True):
+            seen = -torch.expm1(-self.log_density(part).clamp_max(MAX_LOG_DENSITY).exp() * longest)
             self.alpha.scatter_reduce_(0, index, seen, "amax")
         self.occupy(self.alpha > self.alpha.mean().clamp_max(self.free_below))
 
@@ -130,13 +123,13 @@ class HashField(OccupiedField):
         """``[V]`` boolean: the cells on those rays of the world that meet none of ``cells``, ``[V]``, and those next to
         them, as rays lie apart.
         """
-        found, everywhere = torch.zeros_like(cells), torch.ones_like(cells)
-        for part in zip(*(each.split(RAYS) for each in self.space.local(rays)), strict=True):
+        hit, everywhere = torch.zeros_like(cells), torch.ones_like(cells)
+        for part in zip(*(each.split(RAY_CHUNK) for each in self.space.local(rays)), strict=True):
             misses = torch.ones(len(part[0]), dtype=torch.bool, device=cells.device)
             misses[self.samples(Rays(*part), 0.5, cells)[1].long()] = False
             points = self.samples(Rays(*(each[misses] for each in part)), 0.5, everywhere)[2]
-            found[self.grid.nearest(points).long()] = True
-        return dilate(found.float().view(self.grid.shape)).flatten() > 0
+            hit[self.grid.nearest(points).long()] = True
+        return dilate(hit.float().view(self.grid.shape)).flatten() > 0
 
     @torch.no_grad()
     def hits(self, rays: Rays) -> Tensor:
@@ -148,5 +141,5 @@ class HashField(OccupiedField):
     @torch.no_grad()
     def occupy(self, cells: Tensor) -> None:
         """Take all but these cells ``[V]`` for free."""
-        self.occupancy.copy_(cells & self.allowed)  # in place, where recorded steps look
+        self.occupancy.copy_(cells & self.allowed)
         self.around.copy_(self.grid.box_around(self.occupancy))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable
 from typing import Any
 
 import torch
@@ -15,6 +14,7 @@ from ctm_plugin.backbones.radiance import RadianceBackbone, RayRendering, check_
 from ctm_plugin.backbones.settings import NeRFConfig
 from ctm_plugin.backbones.spaces import space_of
 from ctm_plugin.color.photometric import Photometric
+from ctm_plugin.color.transform import ColorTransform
 from ctm_plugin.draws import Draws, seeded
 from ctm_plugin.optim.schedules import Schedule, exponential
 from ctm_plugin.rays.cameras import Rays
@@ -23,7 +23,7 @@ from ctm_plugin.rays.volume import table_weights
 from ctm_plugin.scene.views import Scene
 
 EVAL_BYTES = 200e6
-"""Memory that rendering a chunk of rays may take."""
+"""Memory in bytes that rendering a chunk of rays may take."""
 
 
 class NeRF(RadianceBackbone):
@@ -32,16 +32,17 @@ class NeRF(RadianceBackbone):
     Args:
         config: sizes, steps, rates.
         scene: its geometry must be the configuration's.
-        channels, photometric, seed: see :class:`RadianceBackbone`.
+        transform, photometric, seed: see :class:`RadianceBackbone`.
     """
 
     Config = NeRFConfig
 
     def __init__(
-        self, config: NeRFConfig, scene: Scene, channels: int = 3, photometric: Photometric | None = None, seed: int = 0
-    ):
+        self, config: NeRFConfig, scene: Scene, transform: ColorTransform | None = None,
+        photometric: Photometric | None = None, seed: int = 0,
+    ):  # fmt: skip
         check_geometry(config.geometry, scene)
-        super().__init__(scene, config.rays, channels, photometric, seed)
+        super().__init__(scene, config.rays, transform, photometric, seed)
         self.config = config
         self.total_steps = config.steps
         self.space = space_of(scene, "forward" if config.geometry == "forward" else "bounded")
@@ -52,8 +53,8 @@ class NeRF(RadianceBackbone):
         self.eval_chunk = max(1, int(EVAL_BYTES / (samples * 3 * 4 * config.width)))
         sizes = (config.width, config.depth, config.skip)
         with seeded(seed):
-            self.coarse = NeRFField(channels, *sizes)
-            self.fine = NeRFField(channels, *sizes)
+            self.coarse = NeRFField(self.channels, *sizes)
+            self.fine = NeRFField(self.channels, *sizes)
 
     # Training.
 
@@ -67,6 +68,7 @@ class NeRF(RadianceBackbone):
         return [self.coarse.color.bias, self.fine.color.bias] if self.config.start == "mean" else []
 
     def on_fit_start(self) -> None:
+        super().on_fit_start()
         self._crop()
 
     def on_train_batch_start(self, batch: Any, batch_idx: int) -> None:
@@ -90,9 +92,6 @@ class NeRF(RadianceBackbone):
         pixel = ((view * views.height + rows[:, None]) * views.width + columns).flatten()
         pixel = pixel if views.mask is None else pixel[views.mask.flatten()[pixel]]
         return pixel.int().to(self.device)
-
-    def repeats(self) -> Hashable | None:
-        return self.photometric if self.known else None
 
     # Rendering.
 

@@ -17,12 +17,12 @@ from torch import Tensor
 
 from ctm_plugin.rays.encoding import embed
 
-BLOCK = 4096
+SAMPLE_BLOCK = 4096
 """Samples a block: 4 MiB of float32 at width 256."""
-ROUND = 256
-"""Samples with density are filled up to a multiple of so many: oneDNN keeps a kernel for every size it ever met."""
-AGAIN = 2
-"""Hidden layers that the backward pass evaluates again instead of finding them kept: memory for a little time."""
+SAMPLE_MULTIPLE = 256
+"""Samples with density are padded to a multiple of this: oneDNN keeps a kernel for every size that it ever met."""
+RECOMPUTED_LAYERS = 2
+"""Hidden layers that the backward pass computes anew, so that their outputs need no memory."""
 
 
 class Layers(NamedTuple):
@@ -64,16 +64,16 @@ class Kept:
 
     def __init__(self) -> None:
         self.blocks: list[list[Tensor]] = []
-        self.filled = BLOCK
+        self.filled = SAMPLE_BLOCK
 
     def add(self, index: Tensor, every: Sequence[Tensor], chosen: Sequence[Tensor]) -> None:
         """Append N rows: those at ``index`` ``[N]`` of each table in ``every``, and all of each in ``chosen``."""
         start = 0
         while start < len(index):
-            if self.filled == BLOCK:
-                self.blocks.append([table.new_empty(BLOCK, *table.shape[1:]) for table in (*every, *chosen)])
+            if self.filled == SAMPLE_BLOCK:
+                self.blocks.append([table.new_empty(SAMPLE_BLOCK, *table.shape[1:]) for table in (*every, *chosen)])
                 self.filled = 0
-            stop = min(len(index), start + BLOCK - self.filled)
+            stop = min(len(index), start + SAMPLE_BLOCK - self.filled)
             tables = [table[self.filled : self.filled + stop - start] for table in self.blocks[-1]]
             for table, source in zip(tables, every, strict=False):
                 torch.index_select(source, 0, index[start:stop], out=table)
@@ -123,7 +123,7 @@ class _Query(torch.autograd.Function):
         rays, samples, _ = points.shape
         density = points.new_empty(rays, samples)
         latent = points.new_zeros(rays, samples, len(layers.color))
-        step = max(1, BLOCK // samples)
+        step = max(1, SAMPLE_BLOCK // samples)
         ctx.layers, ctx.skip, ctx.samples, ctx.kept = layers, skip, samples, Kept()
         for start in range(0, rays, step):
             rows = slice(start, start + step)
@@ -139,7 +139,7 @@ class _Query(torch.autograd.Function):
             shown = (F.linear(seen, layers.color).to(points.dtype) + layers.color_bias).sigmoid_()
             latent.flatten(0, 1)[sample] = shown
             if keep:
-                ctx.kept.add(active, [embedded, *hidden[AGAIN:-1]], [last, seen, shown, sample])
+                ctx.kept.add(active, [embedded, *hidden[RECOMPUTED_LAYERS:-1]], [last, seen, shown, sample])
         ctx.empty = density == 0
         return density, latent
 
@@ -147,7 +147,7 @@ class _Query(torch.autograd.Function):
     def backward(ctx, of_density, of_latent):
         layers, of_density = ctx.layers, of_density.masked_fill(ctx.empty, 0)
         grads = Layers.unflatten([torch.zeros_like(tensor, dtype=of_density.dtype) for tensor in layers.flatten()])
-        again = min(AGAIN, len(layers.trunk) - 1)  # the last one is always kept
+        again = min(RECOMPUTED_LAYERS, len(layers.trunk) - 1)  # the last one is always kept
         for embedded, *hidden, seen, latent, sample in ctx.kept:
             hidden = _trunk(embedded, layers, ctx.skip, again) + hidden
             ray = sample.div(ctx.samples, rounding_mode="floor")
@@ -157,9 +157,9 @@ class _Query(torch.autograd.Function):
 
 
 def _active(density: Tensor) -> Tensor:
-    """Indices of the samples with density ``[M]``, and of others up to a multiple of ``ROUND``."""
+    """Indices of the samples with density ``[M]``, and of others up to a multiple of ``SAMPLE_MULTIPLE``."""
     solid, empty = (part.nonzero().squeeze(1) for part in (density > 0, density <= 0))
-    return torch.cat([solid, empty[: -len(solid) % ROUND]])
+    return torch.cat([solid, empty[: -len(solid) % SAMPLE_MULTIPLE]])
 
 
 def _trunk(embedded: Tensor, layers: Layers, skip: int, stop: int | None = None) -> list[Tensor]:

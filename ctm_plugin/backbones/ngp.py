@@ -14,6 +14,7 @@ from ctm_plugin.backbones.radiance import check_geometry
 from ctm_plugin.backbones.settings import NGPConfig
 from ctm_plugin.backbones.spaces import space_of
 from ctm_plugin.color.photometric import Photometric
+from ctm_plugin.color.transform import ColorTransform
 from ctm_plugin.draws import Draws, seeded
 from ctm_plugin.optim.grid_adam import GridAdam
 from ctm_plugin.optim.schedules import Schedule, exponential
@@ -21,10 +22,10 @@ from ctm_plugin.rays.hash_grid import HashGrid
 from ctm_plugin.scene.frustum import visual_hull
 from ctm_plugin.scene.views import Scene
 
-SETTLED = 16
-"""Looks at the occupancy before what is free is so for good."""
-SHOWN = 1 << 16
-"""Of pixels that show something, which have to meet something then."""
+SETTLING_UPDATES = 16
+"""Updates of the occupancy before free cells become permanently free."""
+FOREGROUND_PIXELS = 1 << 16
+"""Number of foreground pixels whose rays must still hit a cell then."""
 
 
 class NGP(OccupiedBackbone):
@@ -33,17 +34,18 @@ class NGP(OccupiedBackbone):
     Args:
         config: sizes, steps, rates.
         scene: its geometry must be the configuration's.
-        channels, photometric, seed: see :class:`~ctm_plugin.backbones.radiance.RadianceBackbone`.
+        transform, photometric, seed: see :class:`~ctm_plugin.backbones.radiance.RadianceBackbone`.
     """
 
     Config = NGPConfig
     eval_chunk = 4096
 
     def __init__(
-        self, config: NGPConfig, scene: Scene, channels: int = 3, photometric: Photometric | None = None, seed: int = 0
-    ):
+        self, config: NGPConfig, scene: Scene, transform: ColorTransform | None = None,
+        photometric: Photometric | None = None, seed: int = 0,
+    ):  # fmt: skip
         check_geometry(config.geometry, scene)
-        super().__init__(config, scene, channels, photometric, seed)
+        super().__init__(config, scene, transform, photometric, seed)
         self.total_steps = config.steps
         space = space_of(scene, config.geometry)
         space.divide(space.longest / config.samples)
@@ -53,10 +55,10 @@ class NGP(OccupiedBackbone):
                 space,
                 HashGrid(*sizes),
                 cells=config.cells,
-                channels=channels,
+                channels=self.channels,
                 width=config.width,
                 degrees=config.degrees,
-                threshold=config.threshold,
+                alpha_thre=config.threshold,
                 free_below=config.free_below,
             )
 
@@ -75,6 +77,7 @@ class NGP(OccupiedBackbone):
         return exponential(self.config.lr_final, self.config.steps)
 
     def on_fit_start(self) -> None:
+        super().on_fit_start()
         self.field.occupy(self.field.occupancy)
         self.renew_pool()
 
@@ -92,9 +95,9 @@ class NGP(OccupiedBackbone):
         share = config.occupancy_share if times else 1.0
         draws = Draws(self.seed, step, self.device, stream="occupancy")  # the same in all processes
         self.field.update_occupancy(draws, share)
-        if self.settles and times >= SETTLED and times.bit_count() == 1:
+        if self.settles and times >= SETTLING_UPDATES and times.bit_count() == 1:
             shown = self.shown_pixels()
-            some = shown[draws.integers(len(shown), SHOWN)] if len(shown) else shown
+            some = shown[draws.integers(len(shown), FOREGROUND_PIXELS)] if len(shown) else shown
             self.field.settle(config.free_for_good, self.training_rays(some), self.hull)
             self.renew_pool()
 

@@ -6,8 +6,7 @@ Samples are *packed*, see :mod:`ctm_plugin.rays.volume`.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Hashable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,11 +18,11 @@ from ctm_plugin.backbones.averaging import Averaging
 from ctm_plugin.backbones.radiance import RadianceBackbone, RayBatch, RayRendering
 from ctm_plugin.backbones.spaces import Box
 from ctm_plugin.color.photometric import Photometric
+from ctm_plugin.color.transform import ColorTransform
 from ctm_plugin.draws import Draws
 from ctm_plugin.rays.cameras import Rays
 from ctm_plugin.rays.grid import VoxelGrid
-from ctm_plugin.rays.occupancy import may_meet, occupied_samples, placed_samples
-from ctm_plugin.rays.packing import Packing, Places
+from ctm_plugin.rays.occupancy import may_meet, occupied_samples
 from ctm_plugin.rays.sampling import sample_counts
 from ctm_plugin.rays.volume import distortion, occlusion, segment_sums, volume_weights
 from ctm_plugin.scene.views import Scene
@@ -49,8 +48,8 @@ class Samples:
 
 
 Shade = Callable[[Tensor, Tensor, Tensor], Tensor]
-"""Latents ``[N, k]`` of the samples ``[N]`` of those that a field was evaluated at, with directions ``[R, 3]`` and the
-one, ``[N]``, along which each is looked at."""
+"""Latents ``[N, k]`` of samples, from features ``[N, F]``, directions ``[R, 3]`` and the index ``[N]`` of each sample's
+direction."""
 
 
 class OccupiedField(nn.Module):
@@ -61,21 +60,18 @@ class OccupiedField(nn.Module):
     Args:
         space: where it lives.
         grid: of the occupancy.
-        threshold: samples with less alpha, or less weight, are skipped.
+        alpha_thre: samples with less alpha, or less weight, are skipped.
 
     Attributes:
         occupancy: ``[V]`` boolean.
         around: ``[2, 3]``, a box with all that is occupied, in which rays are looked at.
-        packing: which samples of the latest rays were chosen.
     """
 
-    packing: Packing
-
-    def __init__(self, space: Box, grid: VoxelGrid, threshold: float):
+    def __init__(self, space: Box, grid: VoxelGrid, alpha_thre: float):
         super().__init__()
-        self.space, self.grid, self.threshold = space, grid, threshold
+        self.space, self.grid, self.alpha_thre = space, grid, alpha_thre
         self.register_buffer("occupancy", torch.ones(grid.count, dtype=torch.bool))
-        self.register_buffer("around", space.box.clone())
+        self.register_buffer("around", space.aabb.clone())
 
     def evaluate(self, points: Tensor, *known: Tensor) -> tuple[Tensor, Shade]:
         """Densities ``[M]``, optical depths over one measure of the space, at its points ``[M, 3]``, and their shade.
@@ -84,71 +80,55 @@ class OccupiedField(nn.Module):
         """
         raise NotImplementedError
 
-    def reached(self, t: Tensor, ray_index: Tensor, points: Tensor, packing: Packing) -> tuple[Tensor, ...]:
-        """Those samples ``[N]`` of the rays that are worth a gradient, and what is known there."""
+    def reached(self, t: Tensor, ray_index: Tensor, points: Tensor, n_rays: int) -> tuple[Tensor, ...]:
+        """Those samples ``[N]`` of ``n_rays`` rays that are worth a gradient, and what is known there."""
         return t, ray_index, points
 
-    def samples(
-        self, rays: Rays, offset: Tensor | float, cells: Tensor | None = None, packing: Packing | None = None
-    ) -> tuple[Tensor, Tensor, Tensor]:
+    def samples(self, rays: Rays, offset: Tensor | float, cells: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor]:
         """``t`` ``[M]``, rays ``[M]`` and points ``[M, 3]`` of the space's rays, those outside free space, or in these
-        cells ``[V]``; ``packing`` counts them, and may have places for them.
+        cells ``[V]``.
         """
         grid, stride = self.grid, self.space.stride
-        occupancy, around = (self.occupancy, self.around) if cells is None else (cells, self.space.box)
+        occupancy, around = (self.occupancy, self.around) if cells is None else (cells, self.space.aabb)
         enter, leave = self.space.ends(rays, around)
         counts = sample_counts(enter, leave, stride, offset)
-        buffers = grid.box[0], grid.scale, grid.last, grid.offsets
+        buffers = grid.aabb[0], grid.scale, grid.last, grid.offsets
         first = enter + offset * stride
-        given = *rays, first, counts, stride, occupancy, *buffers, self.space.contracted
-        if packing is None or packing.places is None:
-            found = occupied_samples(*given)
-            count = len(found[0])
-        else:
-            *found, count = placed_samples(*given, packing.spare_rays(first.device))
-        if packing is not None:
-            packing.counts.append(count)
-        return tuple(found)
+        return occupied_samples(*rays, first, counts, stride, occupancy, *buffers, self.space.contracted)
 
-    def forward(
-        self, rays: Rays, background: Tensor, offset: Tensor | float, places: tuple[int, ...] | None = None
-    ) -> tuple[Tensor, Tensor, Samples]:
+    def forward(self, rays: Rays, background: Tensor, offset: Tensor | float) -> tuple[Tensor, Tensor, Samples]:
         """Render the world's rays: latent ``[R, k]``, expected depth ``[R]``, and the samples behind them.
 
-        Only samples whose weight is above the threshold are shaded.
+        Only samples whose weight is above ``alpha_thre`` are shaded.
 
         Args:
             rays: R of them.
             background: ``[R, k]`` or ``[1, k]`` latent.
             offset: where in a stride samples begin, in [0, 1): ``[R]``, or one for all.
-            places: for the samples of each stage, see :class:`~ctm_plugin.rays.packing.Packing`.
         """
-        self.packing = packing = Packing(len(rays.origins), places)
+        n_rays = len(rays.origins)
         with record_function("ctm/samples"):
-            samples = self.samples(self.space.local(rays), offset, packing=packing)
-            t, ray_index, points, *known = self.reached(*samples, packing)
+            t, ray_index, points, *known = self.reached(*self.samples(self.space.local(rays), offset), n_rays)
         density, shade = self.evaluate(points, *known)
         optical_depth = density * self.space.lengths(t, points)
-        keep, ray_index = packing.choose(optical_depth.detach() > -math.log1p(-self.threshold), ray_index)
-        optical_depth, t = taken(keep, optical_depth, t)
-        weights, transmittance = volume_weights(optical_depth, ray_index, packing.rays)
-        transmittance = transmittance[: packing.n_rays]
+        keep = (optical_depth.detach() > -math.log1p(-self.alpha_thre)).nonzero().squeeze(1)
+        optical_depth, t, ray_index = taken(keep, optical_depth, t, ray_index)
+        weights, transmittance = volume_weights(optical_depth, ray_index, n_rays)
         with torch.no_grad():
-            distances = self.space.distances(rays, t, packing.within(ray_index))
-            depth = packing.sums(weights * distances, ray_index) + transmittance * self.space.behind
+            distances = self.space.distances(rays, t, ray_index)
+            depth = segment_sums(weights * distances, ray_index, n_rays) + transmittance * self.space.behind
 
-        seen, ray_index = packing.choose(weights.detach() > self.threshold, ray_index)
-        weights, t, keep = taken(seen, weights, t, keep)
-        weights, ray_index = packing.closed(weights, ray_index)
+        seen = (weights.detach() > self.alpha_thre).nonzero().squeeze(1)
+        weights, t, keep, ray_index = taken(seen, weights, t, keep, ray_index)
         latent = shade(keep, rays.directions, ray_index)
-        light = segment_sums(weights[:, None] * latent, ray_index, packing.n_rays)
+        light = segment_sums(weights[:, None] * latent, ray_index, n_rays)
         rendered = light + transmittance[:, None] * background
         return rendered, depth, Samples(latent, weights, t, ray_index, transmittance)
 
     def query(self, points: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
         """Density ``[M]`` and latent ``[M, k]`` at points of the world, see :meth:`PosedBackbone.query`."""
         local, unit = self.space.place(points)
-        low, high = self.space.box
+        low, high = self.space.aabb
         there = ((local >= low) & (local <= high)).all(1) & self.occupancy[self.grid.nearest(local)]
         density, shade = self.evaluate(torch.minimum(torch.maximum(local, low), high))
         every = torch.arange(len(points), device=points.device)
@@ -158,7 +138,7 @@ class OccupiedField(nn.Module):
     def hits(self, rays: Rays) -> Tensor:
         """``[R]`` boolean: whether a ray of the world may meet an occupied cell; errs to True."""
         rays = self.space.local(rays)
-        return may_meet(rays, *self.space.ends(rays, self.space.box), self.grid, self.occupancy)
+        return may_meet(rays, *self.space.ends(rays, self.space.aabb), self.grid, self.occupancy)
 
 
 def taken(keep: Tensor, *tables: Tensor) -> tuple[Tensor, ...]:
@@ -186,44 +166,29 @@ class OccupiedBackbone(Averaging, RadianceBackbone):
 
     Args:
         config: with ``rays``, ``rays_per_pixel``, ``relative``, ``averaged``, ``start``, ``distortion``, ``occlusion``.
-        scene, channels, photometric, seed: see :class:`RadianceBackbone`.
+        scene, transform, photometric, seed: see :class:`RadianceBackbone`.
     """
 
     field: OccupiedField
 
-    def __init__(self, config: Any, scene: Scene, channels: int, photometric: Photometric | None, seed: int):
-        super().__init__(scene, config.rays, channels, photometric, seed)
+    def __init__(
+        self, config: Any, scene: Scene, transform: ColorTransform | None, photometric: Photometric | None, seed: int
+    ):  # fmt: skip
+        super().__init__(scene, config.rays, transform, photometric, seed)
         self.config = config
         self.relative, self.rays_per_pixel = config.relative, config.rays_per_pixel
         self.mean_field = None
-        self.places, self.placed = Places(), False
 
     def color_biases(self) -> list[Tensor]:
         return [self.field.color.layers[-1].bias] if self.config.start == "mean" else []
 
     def render(self, rays: Rays, background: Tensor, draws: Draws | None) -> OccupiedRendering:
         offset = 0.5 if draws is None else draws.uniform(len(rays.origins), 1).squeeze(1)
-        places = self.places.found if self.placed else None
-        latent, depth, samples = self.pictured_field(rays, background, offset, places)
-        if torch.is_grad_enabled():
-            self.places.watch(self.field.packing.counts)
+        latent, depth, samples = self.pictured_field(rays, background, offset)
         return OccupiedRendering((latent,), opacity=1 - samples.transmittance.detach(), depth=depth, samples=samples)
 
     def query(self, points: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
         return self.pictured_field.query(points, directions)
-
-    def repeats(self) -> Hashable | None:
-        """As of every backbone, once some steps have shown how many places the samples of the next need."""
-        places = self.places.settle(self.field.space.stride, self.device) if self.known else None
-        return places and (self.photometric, places)
-
-    @contextmanager
-    def fixed_sizes(self) -> Iterator[None]:
-        self.placed = True
-        try:
-            yield
-        finally:
-            self.placed = False
 
     def regularisers(self, batch: RayBatch, rendering: OccupiedRendering, target: Tensor) -> dict[str, Tensor]:
         """How far apart the weights of a ray lie, and how close before its camera, as shares of the way from near to
@@ -233,8 +198,8 @@ class OccupiedBackbone(Averaging, RadianceBackbone):
         whole = space.far - space.near
         along = (samples.t - space.near) / whole
         if weight := self.config.distortion:
-            found = distortion(samples.weights, along, samples.ray_index, len(target), space.stride / whole)
-            terms["distortion"] = weight * found
+            term = distortion(samples.weights, along, samples.ray_index, len(target), space.stride / whole)
+            terms["distortion"] = weight * term
         if weight := self.config.occlusion:
             terms["occlusion"] = weight * occlusion(samples.weights, along, len(target))
         return terms

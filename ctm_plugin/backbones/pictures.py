@@ -12,12 +12,13 @@ from torch import Tensor
 from ctm_plugin.backbones.base import Batch, Rendering
 from ctm_plugin.backbones.posed import PosedBackbone
 from ctm_plugin.color.photometric import Photometric
+from ctm_plugin.color.transform import ColorTransform
 from ctm_plugin.draws import Draws
 from ctm_plugin.errors import ConfigError
 from ctm_plugin.scene.views import Scene, Views, composite
 
 
-class Picture(NamedTuple):
+class RenderedView(NamedTuple):
     """What a camera sees."""
 
     latent: Float[Tensor, "h w k"]
@@ -49,7 +50,7 @@ class PictureBatch(Batch):
 class PictureRendering(Rendering):
     """The whole pictures, and the latents of the pixels that count."""
 
-    pictures: list[Picture] = field(kw_only=True)
+    pictures: list[RenderedView] = field(kw_only=True)
 
 
 class PictureBackbone(PosedBackbone):
@@ -61,22 +62,22 @@ class PictureBackbone(PosedBackbone):
     Args:
         scene: training and test views.
         views_a_step: at least as many as there are processes.
-        channels, photometric, seed: see :class:`~ctm_plugin.backbones.base.Backbone`.
+        transform, photometric, seed: see :class:`~ctm_plugin.backbones.base.Backbone`.
     """
 
     def __init__(
-        self, scene: Scene, views_a_step: int = 1, channels: int = 3, photometric: Photometric | None = None,
-        seed: int = 0,
+        self, scene: Scene, views_a_step: int = 1, transform: ColorTransform | None = None,
+        photometric: Photometric | None = None, seed: int = 0,
     ):  # fmt: skip
         pixels = scene.train.height * scene.train.width
-        super().__init__(scene, views_a_step * pixels, channels, photometric, seed)
+        super().__init__(scene, views_a_step * pixels, transform, photometric, seed)
         self.views_a_step = views_a_step
 
     def learn_from(self, views: Views) -> None:
         super().learn_from(views)
         self.ends = None if views.mask is None else [0, *views.mask.flatten(1).sum(1).cumsum(0).tolist()]
 
-    def render(self, views: Views, index: int, background: Tensor, draws: Draws | None, every: int = 1) -> Picture:
+    def render(self, views: Views, index: int, background: Tensor, draws: Draws | None, every: int = 1) -> RenderedView:
         """Render a view in the latent space.
 
         Args:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -13,12 +13,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ctm_plugin.appearance.exposure import Place
-from ctm_plugin.appearance.photographed import photographed, shown, undo_exposure
-from ctm_plugin.backbones.base import COLORS, Backbone, Compared
+from ctm_plugin.appearance.exposure import PixelPlaces
+from ctm_plugin.appearance.photographed import exposed, photographed, undo_exposure
+from ctm_plugin.backbones.base import Backbone, Compared
 from ctm_plugin.color.light import AS_IS, Light, chosen_light, find_light
 from ctm_plugin.color.photometric import Photometric
-from ctm_plugin.color.transform import Uniform
+from ctm_plugin.color.prepare import SAMPLE_COLORS
+from ctm_plugin.color.transform import ColorTransform, Uniform
 from ctm_plugin.draws import Draws
 from ctm_plugin.errors import CTMError
 from ctm_plugin.metrics.detail import detail_moments
@@ -32,7 +33,7 @@ from ctm_plugin.show.pictures import depth_picture, latent_picture, write_png
 from ctm_plugin.show.snapshot import Snapshot, compared
 
 UNIFORM_VARIANCE = 1 / 12
-"""Of numbers uniform in [0, 1], about that of lit pictures: what regularisers' weights are made for."""
+"""Variance of numbers uniform in [0, 1], about that of lit pictures; the weights of regularisers are made for it."""
 
 
 class PosedBackbone(Backbone):
@@ -45,20 +46,21 @@ class PosedBackbone(Backbone):
     Args:
         scene: training and test views.
         batch_rays: training pixels a step, over all processes.
-        channels, photometric, seed: see :class:`Backbone`.
+        transform, photometric, seed: see :class:`Backbone`.
     """
 
     Scene = Scene
     posed = True
     geometries = GEOMETRIES
-    """Of scenes that it can train on, for ``dataset.geometry=auto`` to choose among."""
+    """Geometries that it can train on; ``dataset.geometry=auto`` chooses among them."""
     relative = False
-    """Whether photometric terms are taken over 12 times the variance of the training colours."""
+    """Whether photometric terms are divided by 12 times the variance of the training colours."""
 
     def __init__(
-        self, scene: Scene, batch_rays: int, channels: int = 3, photometric: Photometric | None = None, seed: int = 0
-    ):
-        super().__init__(channels, photometric, seed)
+        self, scene: Scene, batch_rays: int, transform: ColorTransform | None = None,
+        photometric: Photometric | None = None, seed: int = 0,
+    ):  # fmt: skip
+        super().__init__(transform, photometric, seed)
         self.scene = scene
         self.batch_rays = batch_rays
         self.loss_scale = 1.0
@@ -119,12 +121,12 @@ class PosedBackbone(Backbone):
         centre, radius = camera_ball(scene.train, scene.near)
         return torch.stack([centre - radius, centre + radius])
 
-    def place(self, pixel: Tensor, rendered: Tensor) -> Place:
+    def place(self, pixel: Tensor, rendered: Tensor) -> PixelPlaces:
         """Where training pixels ``[R]`` lie on their pictures, with what is rendered there, ``[R, 3]`` sRGB."""
         height, width = self.views.height, self.views.width
         row = pixel.div(width, rounding_mode="floor")
         at = torch.stack([(pixel % width + 0.5) / width, (row % height + 0.5) / height], dim=-1)
-        return Place(row.div(height, rounding_mode="floor"), at, rendered.detach())
+        return PixelPlaces(row.div(height, rounding_mode="floor"), at, rendered.detach())
 
     def compare(self, batch: Any, latents: list[Tensor], uniform: Uniform) -> Compared:
         """As every backbone, but renderings ``[R, k]`` as the pictures show them, and these as the field should."""
@@ -157,7 +159,7 @@ class PosedBackbone(Backbone):
         # No camera took it: it counts as what each picture would have shown of it.
         behind = behind.expand(len(pixel), -1)
         with torch.no_grad(), torch.autocast(self.device.type, enabled=False):  # colours want more than half precision
-            return shown(self.appearance, behind, self.place(pixel, behind))
+            return exposed(self.appearance, behind, self.place(pixel, behind))
 
     @torch.no_grad()
     def backgrounds(self, draws: Draws, rows: int, first: int = 0) -> tuple[Tensor, Tensor]:
@@ -208,7 +210,7 @@ class PosedBackbone(Backbone):
             return Light(*self.scene.light)
         if self.appearance is None:
             return self._light
-        pixel = self._pixels(Draws(self.seed, 0, self.device, stream="colors"), COLORS, self.unmasked)
+        pixel = self._pixels(Draws(self.seed, 0, self.device, stream="colors"), SAMPLE_COLORS, self.unmasked)
         colors = unit(self.pixels[pixel])
         rgb = undo_exposure(self.appearance, colors[:, :3], self.place(pixel, colors[:, :3]))
         return find_light(torch.cat([rgb, colors[:, 3:]], dim=1))
@@ -217,20 +219,24 @@ class PosedBackbone(Backbone):
     def _light(self) -> Light:
         return find_light(self.scene.train.images, self.scene.train.mask)
 
-    def targets(self) -> list[Float[Tensor, "h w 3"] | None]:
-        """The test views over the constant background, on the CPU; ``None`` for those without a picture."""
-        views, background = self.scene.test, self.constant_background().cpu()
-        pictured = [True] * len(views) if views.pictured is None else views.pictured.tolist()
-        return [
-            composite(image, background) if there else None for image, there in zip(views.images, pictured, strict=True)
-        ]
+    @property
+    def snapshots(self) -> Sequence[int]:
+        """Test views that have a picture; else the first one."""
+        views = self.scene.test
+        return range(len(views)) if views.pictured is None else views.pictured.nonzero().flatten().tolist() or [0]
 
-    def scores(self, folder: Path, scoring: Scoring) -> dict[str, Any]:
-        """Render every test view into ``folder`` and score the decoded colours against the pictures as captured.
+    def target(self, view: int) -> Float[Tensor, "h w 3"] | None:
+        """A test view over the constant background, on the CPU; ``None``: there is no picture of it."""
+        views = self.scene.test
+        there = views.pictured is None or bool(views.pictured[view])
+        return composite(views.images[view], self.constant_background().cpu()) if there else None
 
-        Writes ``lit/NAME.png`` and next to it ``photo``, the photograph, both lit where the scene is dark;
-        ``dark`` (as rendered, of dark scenes), ``depth`` and ``latent``. Where there are pictures in normal light, lit
-        views are scored against them.
+    def scores(self, folder: Path | None, scoring: Scoring) -> dict[str, Any]:
+        """Render every test view and score the decoded colours against the pictures as captured.
+
+        Where there is a ``folder``, writes ``lit/NAME.png`` and next to it ``photo``, the photograph, both lit where
+        the scene is dark; ``dark`` (as rendered, of dark scenes), ``depth`` and ``latent``. Where there are pictures in
+        normal light, lit views are scored against them.
 
         Returns:
             See :func:`ctm_plugin.metrics.evaluate.summarize`, with ``protocol``, ``light_factor``,
@@ -238,7 +244,7 @@ class PosedBackbone(Backbone):
         """
         scene, views = self.scene, self.scene.test
         light = chosen_light(scoring.light, self.light)
-        targets = self.targets()
+        targets = [self.target(view) for view in range(len(views))]
         self.eval()
         masks = None if views.mask is None else list(views.mask.cpu())
         rendered, depths, details = [], [], []
@@ -257,7 +263,7 @@ class PosedBackbone(Backbone):
                     pictures["dark"] = view["rgb"]
                 pictures["depth"] = depth_picture(view["depth"], scene.near, scene.far)
                 pictures["latent"] = latent_picture(view["latent"])
-                for kind, picture in pictures.items():
+                for kind, picture in pictures.items() if folder else ():
                     write_png(folder / kind / f"{views.names[index]}.png", picture)
             result = summarize(
                 views.names,
@@ -272,8 +278,8 @@ class PosedBackbone(Backbone):
                 light=light,
                 details=details,
             )
-        told = {"light_factor": light.gain, "light_contrast": light.contrast, "light_saturation": light.saturation}
-        return result | told | {"protocol": self._protocol(scoring.dataset)}
+        lit = {"light_factor": light.gain, "light_contrast": light.contrast, "light_saturation": light.saturation}
+        return result | lit | {"protocol": self._protocol(scoring.dataset)}
 
     def _protocol(self, dataset: Mapping[str, Any]) -> str:
         """What two runs must share for their scores to stand in one cell of a table."""
@@ -286,17 +292,16 @@ class PosedBackbone(Backbone):
             f"PSNR and SSIM per image then mean"
         )
 
-    def snapshot(self) -> Snapshot:
-        """Show the first test view that has a picture (:func:`ctm_plugin.show.snapshot.compared`), else the first one
-        without it, and ``test/depth``. With one ray a pixel, as training waits for it.
+    def snapshot(self, view: int) -> Snapshot:
+        """Show a test view next to its picture, if it has one (:func:`ctm_plugin.show.snapshot.compared`), and
+        ``test/depth``. With one ray a pixel, as training waits for it.
         """
         scene, views, every = self.scene, self.scene.test, self.stride(self.scene.test.height, self.scene.test.width)
-        targets = self.targets()
-        index = next((index for index, target in enumerate(targets) if target is not None), 0)
-        view = self.render_view(views, index, every, rays=1)
-        view = {name: value.float().cpu() for name, value in view.items()}
-        target = None if targets[index] is None else targets[index][::every, ::every]
-        mask = None if views.mask is None else views.mask[index, ::every, ::every].cpu()
-        shown = compared(view["rgb"], target, view["latent"], scene.exposure, self.light, mask)
-        shown.pictures["test/depth"] = depth_picture(view["depth"], scene.near, scene.far)
-        return shown
+        seen = self.render_view(views, view, every, rays=1)
+        seen = {name: value.float().cpu() for name, value in seen.items()}
+        target = self.target(view)
+        target = None if target is None else target[::every, ::every]
+        mask = None if views.mask is None else views.mask[view, ::every, ::every].cpu()
+        compared_views = compared(seen["rgb"], target, seen["latent"], scene.exposure, self.light, mask)
+        compared_views.pictures["test/depth"] = depth_picture(seen["depth"], scene.near, scene.far)
+        return compared_views

@@ -11,6 +11,7 @@ from torch import Tensor
 from ctm_plugin.backbones.base import Batch, Rendering
 from ctm_plugin.backbones.posed import PosedBackbone
 from ctm_plugin.color.photometric import Photometric
+from ctm_plugin.color.transform import ColorTransform
 from ctm_plugin.draws import Draws, FixedDraws
 from ctm_plugin.errors import ConfigError
 from ctm_plugin.gpu.room import times_a_chunk
@@ -18,7 +19,7 @@ from ctm_plugin.rays.cameras import Rays, pixel_rays, within_pixel
 from ctm_plugin.scene.views import Scene, Views, composite
 
 POOL_CHUNK = 1 << 16
-"""Rays marched at a time when the pool of training pixels is drawn: some 200 MB."""
+"""Rays marched at once when the pool of training pixels is drawn: some 200 MB."""
 
 
 def check_geometry(geometry: str, scene: Scene) -> None:
@@ -71,17 +72,19 @@ class RadianceBackbone(PosedBackbone):
     Args:
         scene: training and test views.
         batch_rays: rays a step, over all processes.
-        channels, photometric, seed: see :class:`Backbone`.
+        transform, photometric, seed: see :class:`Backbone`.
     """
 
     eval_chunk = 8192
     rays_per_pixel = 1
-    """Of pictures, see :func:`~ctm_plugin.rays.cameras.within_pixel`; several draw what :class:`FixedDraws` gives."""
+    """Rays a pixel of a picture, see :func:`~ctm_plugin.rays.cameras.within_pixel`; several come from
+    :class:`FixedDraws`."""
 
     def __init__(
-        self, scene: Scene, batch_rays: int, channels: int = 3, photometric: Photometric | None = None, seed: int = 0
-    ):
-        super().__init__(scene, batch_rays, channels, photometric, seed)
+        self, scene: Scene, batch_rays: int, transform: ColorTransform | None = None,
+        photometric: Photometric | None = None, seed: int = 0,
+    ):  # fmt: skip
+        super().__init__(scene, batch_rays, transform, photometric, seed)
         self.register_buffer("pool", None, persistent=False)
 
     def render(self, rays: Rays, background: Tensor, draws: Draws | None) -> RayRendering:
@@ -147,11 +150,11 @@ class RadianceBackbone(PosedBackbone):
             None if of_all is None else of_all[index : index + 1].to(self.device)
             for of_all in (views.c2w, views.intrinsics, views.distortion)
         )
-        found: dict[str, Tensor] = {}
+        pixels: dict[str, Tensor] = {}
         for right, down, offset in within_pixel(count):
             through = pixel_rays(c2w, intrinsics, height, width, pixel.flatten(), distortion, right, down)
             out = self.render_rays(through, even=FixedDraws(offset, self.device) if count > 1 else None)
             for name in ("latent", "depth", "opacity"):
-                found[name] = found.get(name, 0) + getattr(out, name) / count
-        shaped = {"rgb": self.decode(found["latent"])} | found
+                pixels[name] = pixels.get(name, 0) + getattr(out, name) / count
+        shaped = {"rgb": self.decode(pixels["latent"])} | pixels
         return {name: value.unflatten(0, pixel.shape) for name, value in shaped.items()}

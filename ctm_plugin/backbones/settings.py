@@ -4,14 +4,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from ctm_plugin.color.settings import KINDS
+from ctm_plugin.color.settings import LOSS_KINDS
 from ctm_plugin.scene.kinds import GEOMETRIES
 from ctm_plugin.settings.setting import Settings, by_geometry, setting
 
-STARTS = ("mean", "grey")
-"""What a field's colours may be before its first step: the scene's mean, or the middle of the latent cube."""
+COLOR_STARTS = ("mean", "grey")
+"""A field's colours before its first step: the scene's mean, or the middle of the latent cube."""
 DVGO_GEOMETRIES = ("bounded", "forward")
+"""Geometries that DVGO trains on."""
 SQUARES = tuple(side * side for side in range(1, 17))
+"""Numbers that are a square of an integer: pixels of an averaging square."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -21,7 +23,7 @@ class FieldConfig(Settings, section="backbone"):
     start: str = setting(
         "mean",
         "colour of the field before the first step (of DVGO's fine stage): mean (the scene's mean colour) or grey",
-        choices=STARTS,
+        choices=COLOR_STARTS,
     )
     threshold: float = setting(
         1e-4, "samples (of DVGO's fine stage) with less alpha or less weight are skipped", above=0, below=1
@@ -237,7 +239,7 @@ class NeRFConfig(Settings, section="backbone"):
     start: str = setting(
         "mean",
         "colour of the field before the first step: mean (the scene's mean colour) or grey (as in NeRF)",
-        choices=STARTS,
+        choices=COLOR_STARTS,
     )
 
     def __post_init__(self) -> None:
@@ -251,8 +253,8 @@ class SplatConfig(Settings, section="backbone"):
     """The defaults are those of 3DGS.
 
     Captures (``dataset=colmap``, ``dataset=transforms``) train splats when no backbone is named. On a GPU Triton's
-    kernels composite them, or gsplat, which the extra ``splat`` brings; without either they stay on the processor. More
-    of ``bend``, ``opacity`` and ``size`` makes better surfaces between the views, and slightly worse views.
+    kernels composite them; without it they stay on the processor. More of ``bend``, ``opacity`` and ``size`` makes
+    better surfaces between the views, and slightly worse views.
     """
 
     steps: int = setting(30000, "training steps", least=1)
@@ -289,7 +291,7 @@ class SplatConfig(Settings, section="backbone"):
         0.2, "share of structural dissimilarity in the loss; absolute differences have the rest", least=0, below=1
     )
     photometric: str = setting(
-        "l1", "distance between colours where loss=auto: l1, or mse, which leaves dssim out", choices=KINDS
+        "l1", "distance between colours where loss=auto: l1, or mse, which leaves dssim out", choices=LOSS_KINDS
     )
     relative: bool = setting(True, "scale the scene's colours to fill [0, 1] for training, as in lit photographs")
     opacity: float = setting(0.0, "weight of the Gaussians' mean opacity", least=0)

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from ctm_plugin.rays.cameras import Rays
-from ctm_plugin.rays.contraction import INFINITY, RADIUS, contract, distance, lengths, paced, travelled
+from ctm_plugin.rays.contraction import BALL_RADIUS, END_PACE, contract, distance, lengths, paced, travelled
 from ctm_plugin.rays.grid import Shape, voxel_size
 from ctm_plugin.rays.ndc import NDC
 from ctm_plugin.rays.sampling import intersect_box
@@ -37,7 +37,7 @@ class Box(nn.Module):
 
     def __init__(self, box: Tensor, near: float, far: float, behind: float):
         super().__init__()
-        self.register_buffer("box", box.float(), persistent=False)
+        self.register_buffer("aabb", box.float(), persistent=False)
         self.near, self.far, self.behind = near, far, behind
         self.side = self.measure = float((box[1] - box[0]).max())
         self.longest = float((box[1] - box[0]).norm())
@@ -48,7 +48,7 @@ class Box(nn.Module):
 
     def spacing(self, shape: Shape) -> float:
         """The way along its rays from one vertex of a grid of that shape to the next."""
-        return voxel_size(self.box, shape[0] * shape[1] * shape[2])
+        return voxel_size(self.aabb, shape[0] * shape[1] * shape[2])
 
     def local(self, rays: Rays) -> Rays:
         """The world's rays in the space."""
@@ -60,7 +60,7 @@ class Box(nn.Module):
 
     def unit(self, points: Tensor) -> Tensor:
         """Its points ``[M, 3]`` in the unit cube, of which shorter sides of the box fill a part."""
-        return (points - self.box[0]) / self.side
+        return (points - self.aabb[0]) / self.side
 
     def lengths(self, t: Tensor, points: Tensor) -> Tensor | float:
         """How long samples are, ``[M]`` or one number for all, in ``measure``."""
@@ -110,12 +110,12 @@ class Ball(Box):
 
     def __init__(self, centre: Tensor, radius: float, near: float, behind: float):
         start = float(paced(torch.tensor(near / radius)))
-        super().__init__(torch.tensor([[-RADIUS] * 3, [RADIUS] * 3]), start, INFINITY, behind)
+        super().__init__(torch.tensor([[-BALL_RADIUS] * 3, [BALL_RADIUS] * 3]), start, END_PACE, behind)
         self.register_buffer("centre", centre.float(), persistent=False)
-        self.radius, self.longest = radius, INFINITY
+        self.radius, self.longest = radius, END_PACE
 
     def divide(self, stride: float) -> None:
-        self.stride, self.far = stride, INFINITY - stride
+        self.stride, self.far = stride, END_PACE - stride
 
     def local(self, rays: Rays) -> Rays:
         return Rays((rays.origins - self.centre) / self.radius, rays.directions)

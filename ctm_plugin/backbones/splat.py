@@ -11,10 +11,11 @@ from torch import Tensor, nn
 from torch.optim import Optimizer
 
 from ctm_plugin.backbones.base import rewrap
-from ctm_plugin.backbones.pictures import Picture, PictureBackbone, PictureBatch, PictureRendering
+from ctm_plugin.backbones.pictures import PictureBackbone, PictureBatch, PictureRendering, RenderedView
 from ctm_plugin.backbones.settings import SplatConfig
 from ctm_plugin.color.dssim import dssim
 from ctm_plugin.color.photometric import Photometric
+from ctm_plugin.color.transform import ColorTransform
 from ctm_plugin.draws import Draws
 from ctm_plugin.optim.grid_adam import GridAdam
 from ctm_plugin.optim.named_optimizers import NamedOptimizers
@@ -23,36 +24,36 @@ from ctm_plugin.optim.schedules import exponential
 from ctm_plugin.scene.views import Scene, Views
 from ctm_plugin.splats.gaussians import Camera, Gaussians, camera_of
 from ctm_plugin.splats.growth import Change, densify
-from ctm_plugin.splats.render import INVERSE, PLANE, bends, expected_depth, picture
+from ctm_plugin.splats.render import INVERSE_CHANNELS, PLANE_CHANNELS, bends, expected_depth, picture
 from ctm_plugin.splats.scales import Stage, averaged, stages
-from ctm_plugin.splats.start import HARMONIC, first_gaussians, first_places
+from ctm_plugin.splats.start import SH_C0, first_gaussians, first_places
 
-LEAST_RANGE = 0.002
-"""Half a grey level: no scene's colours count as filling less."""
-NEAREST = 0.2
-"""In the scene's near: what lies nearer to a camera is not shown."""
-RESET = 0.01
-"""Opacity that none exceeds after a reset."""
-LR_SCALES, LR_TURNS, LR_COLORS = 5e-3, 1e-3, 2.5e-3
-"""Learning rates of 3DGS: of the logarithms of sizes, of the rotations' quaternions, of colours."""
+MIN_RANGE = 0.002
+"""Least range that a scene's colours count as filling: half a grey level."""
+NEAR_FRACTION = 0.2
+"""Near plane of a picture, as a share of the scene's near bound."""
+RESET_OPACITY = 0.01
+"""Largest opacity after a reset (3DGS)."""
+LR_SCALES, LR_QUATS, LR_SH0 = 5e-3, 1e-3, 2.5e-3
+"""Learning rates of 3DGS: of the logarithms of scales, of quaternions, of colours."""
 LR_MEANS_FINAL = 0.01
-"""What the learning rate of places falls to by the last step, as a factor."""
-GROWN = 0.7
-"""What Gaussians cost when all are there, of what the pixels of a step do."""
+"""Factor that the learning rate of means has fallen to at the last step."""
+SPLAT_COST = 0.7
+"""Cost of rendering the full number of Gaussians, where a step's pixels cost 1."""
 PARTS = 64
-"""Of some steps, whose costs are added up."""
+"""Number of equal parts in which the cost of a range of steps is summed."""
 
 
 class Splat(PictureBackbone):
     """Gaussians that are trained view by view.
 
-    What they render, v, stands for the latent ``low + range v``: the training colours, encoded, fill [0, 1] in v. So
+    A rendered value v stands for the latent ``low + range v``: the training colours, encoded, fill [0, 1] in v. So
     their constants meet the same colours in any space, and in the dark as in the light.
 
     Args:
         config: sizes, steps, rates.
         scene: with the points to begin at, if it has them.
-        channels, photometric, seed: see :class:`~ctm_plugin.backbones.base.Backbone`.
+        transform, photometric, seed: see :class:`~ctm_plugin.backbones.base.Backbone`.
     """
 
     Config = SplatConfig
@@ -60,22 +61,22 @@ class Splat(PictureBackbone):
     loops_only = True
 
     def __init__(
-        self, config: SplatConfig, scene: Scene, channels: int = 3, photometric: Photometric | None = None,
-        seed: int = 0,
+        self, config: SplatConfig, scene: Scene, transform: ColorTransform | None = None,
+        photometric: Photometric | None = None, seed: int = 0,
     ):  # fmt: skip
-        super().__init__(scene, config.views, channels, photometric, seed)
+        super().__init__(scene, config.views, transform, photometric, seed)
         self.config = config
         self.low, self.range = 0.0, 1.0
         self.dssim = config.dssim if self.photometric.kind == "l1" else 0.0
         self.set_loss_scale(1 - self.dssim)
         places, self.first_colors = first_places(scene, config.first, seed)
-        first = first_gaussians(places, torch.full((len(places), channels), 0.5), config.degree)
+        first = first_gaussians(places, torch.full((len(places), self.channels), 0.5), config.degree)
         self.tables = nn.ParameterDict({name: nn.Parameter(table) for name, table in first._asdict().items()})
-        self.register_buffer("push", torch.zeros(len(places)))
-        self.register_buffer("seen", torch.zeros(len(places)))
+        self.register_buffer("grad2d", torch.zeros(len(places)))
+        self.register_buffer("grad2d_count", torch.zeros(len(places)))
         centres = scene.train.c2w[:, :, 3]
         self.extent = max(1.1 * float((centres - centres.mean(0)).norm(dim=1).max()), 1e-6)
-        self.most = max(len(places), int(config.per_pixel * len(self.pixels)))
+        self.cap_max = max(len(places), int(config.per_pixel * len(self.pixels)))
         self.pace = Pace(config.steps)
         self.side = 1
         self.cameras: dict[int, Camera] = {}
@@ -93,7 +94,8 @@ class Splat(PictureBackbone):
     @property
     def degrees(self) -> int:
         """How many degrees of harmonics are in use, the constant one included."""
-        step = self.scheduled if self._trainer else self.schedule_steps
+        fitting = self._trainer and self._trainer.state.fn == "fit"  # to others its steps are unknown
+        step = self.scheduled if fitting else self.schedule_steps
         return 1 + min(self.config.degree, int(step) // self.config.degree_every)
 
     # Training.
@@ -109,10 +111,10 @@ class Splat(PictureBackbone):
         return next((stage.side for stage in self.stages if done < stage.until), 1)
 
     def cost(self, first: int | float, last: int | float) -> float:
-        """With a share of the pixels, x of the growth behind it, a step costs the share ``+ 0.7 x^2`` (measured)."""
+        """Cost of steps, each its share of the pixels plus ``0.7 x^2``, x its share of the growth (measured)."""
         step, until = max(last - first, 1) / PARTS, max(self.config.grow_until, 1)
         places = [first + (part + 0.5) * step for part in range(PARTS)]
-        return sum(1 / self.side_at(place) ** 2 + GROWN * min(place / until, 1) ** 2 for place in places) / PARTS
+        return sum(1 / self.side_at(place) ** 2 + SPLAT_COST * min(place / until, 1) ** 2 for place in places) / PARTS
 
     def rays(self, first: int, last: int) -> int | float:
         shares = (1 / self.side_at(self.pace.place(step)) ** 2 for step in range(first, last))
@@ -120,8 +122,8 @@ class Splat(PictureBackbone):
 
     def field_optimizers(self) -> dict[str, Optimizer]:
         config, tables = self.config, self.tables
-        rates = {"scales": LR_SCALES, "turns": LR_TURNS, "opacities": config.lr_opacities}
-        rates |= {"base": LR_COLORS, "rest": LR_COLORS * config.lr_rest}
+        rates = {"scales": LR_SCALES, "quats": LR_QUATS, "opacities": config.lr_opacities}
+        rates |= {"sh0": LR_SH0, "shN": LR_SH0 * config.lr_rest}
         groups = [{"params": [tables[name]], "lr": rate, "name": name} for name, rate in rates.items()]
         means = [{"params": [tables["means"]], "lr": config.lr_means * self.extent, "name": "means"}]
         return {
@@ -143,16 +145,16 @@ class Splat(PictureBackbone):
         if self.config.relative:
             self.find_range()
         colors = self.transform.encode(self.first_colors.to(self.device))
-        self.tables["base"].copy_(((colors - self.low) / self.range - 0.5) / HARMONIC)
+        self.tables["sh0"].copy_(((colors - self.low) / self.range - 0.5) / SH_C0)
 
     def find_range(self) -> None:
-        """Find where the training colours lie among the latents, and weigh the loss by it."""
+        """Find the range of the training colours' latents, and scale the loss by it."""
         colors = self.some_colors()
         ends = torch.tensor([0.001, 0.999], device=self.device)
         spans = [torch.quantile(each, ends, dim=0) for each in (self.transform.encode(colors), colors)]
         # A transform that is not trained yet may have next to none.
         widest = max(float((high - low).max()) for low, high in spans)
-        self.set_range(float(spans[0][0].min()), max(widest, LEAST_RANGE))
+        self.set_range(float(spans[0][0].min()), max(widest, MIN_RANGE))
 
     def set_range(self, low: float, span: float) -> None:
         """Let the latents from ``low`` to ``low + span`` be 0 to 1 of what Gaussians render."""
@@ -161,19 +163,21 @@ class Splat(PictureBackbone):
         self.low, self.range = low, span
         self.set_loss_scale((1 - self.dssim) / (span if self.photometric.kind == "l1" else span**2))
 
-    def render(self, views: Views, index: int, background: Tensor, draws: Draws | None, every: int = 1) -> Picture:
+    def render(self, views: Views, index: int, background: Tensor, draws: Draws | None, every: int = 1) -> RenderedView:
         camera = self._camera(views, index, every)
-        depth, bent = draws is None, draws is not None and self.config.bend > 0
-        shift = torch.zeros(len(self.push), 2, device=self.device, requires_grad=not depth)
-        more = PLANE if depth else INVERSE * bent
+        depth, inverse_depth = draws is None, draws is not None and self.config.bend > 0
+        shift = torch.zeros(len(self.grad2d), 2, device=self.device, requires_grad=not depth)
+        more = PLANE_CHANNELS if depth else INVERSE_CHANNELS * inverse_depth
         with torch.autocast(self.device.type, enabled=False):
-            image, left = picture(self.gaussians, camera, shift, self.degrees, -self.low / self.range, more)
-            colors = image[: self.channels] + left * ((background.float() - self.low) / self.range).T[:, :, None]
+            image, transmittance = picture(self.gaussians, camera, shift, self.degrees, -self.low / self.range, more)
+            colors = (
+                image[: self.channels] + transmittance * ((background.float() - self.low) / self.range).T[:, :, None]
+            )
         if not depth:
-            self.depths += [image[-1] / NEAREST] if bent else []
+            self.depths += [image[-1] / NEAR_FRACTION] if inverse_depth else []
             self.shifts.append((shift, shift.new_tensor([camera.width / 2, camera.height / 2])))
-        found = expected_depth(image, left, camera, self.scene.far) if depth else None
-        return Picture((self.low + self.range * colors).permute(1, 2, 0), 1 - left, found)
+        distance = expected_depth(image, transmittance, camera, self.scene.far) if depth else None
+        return RenderedView((self.low + self.range * colors).permute(1, 2, 0), 1 - transmittance, distance)
 
     def predict(self, batch: PictureBatch, draws: Draws) -> PictureRendering:
         self.depths.clear()
@@ -181,17 +185,14 @@ class Splat(PictureBackbone):
         return super().predict(batch, draws)
 
     def _camera(self, views: Views, index: int, every: int) -> Camera:
-        """The view's camera; those of training views are kept, as finding where a lens ends takes a while."""
+        """The view's camera, cached for training views: finding where a lens ends takes a while."""
         kept = self.cameras if views is self.views and every == 1 else {}
         if index not in kept:
-            kept[index] = camera_of(views, index, NEAREST * self.scene.near, every).on(self.device)
+            kept[index] = camera_of(views, index, NEAR_FRACTION * self.scene.near, every).on(self.device)
         return kept[index]
 
     def regularisers(self, batch: PictureBatch, rendering: PictureRendering, target: Tensor) -> dict[str, Tensor]:
-        """Structural dissimilarity of the pictures, of colours that fill [0, 1]; what does not count is no different.
-
-        And the mean opacity and size of the Gaussians.
-        """
+        """D-SSIM in [0, 1], masked pixels taken as equal; bends; mean opacity and scale of the Gaussians."""
         terms, config = {}, self.config
         if self.dssim:
             targets = self._pictured(batch, rendering, target)
@@ -235,8 +236,8 @@ class Splat(PictureBackbone):
             counted = torch.stack([sum(lengths), sum((each > 0).float() for each in lengths)])
             if trainer and trainer.world_size > 1:  # at once, so that checkpoints hold those of all processes
                 counted = trainer.strategy.reduce(counted, reduce_op="sum")
-            self.push += counted[0]
-            self.seen += counted[1]
+            self.grad2d += counted[0]
+            self.grad2d_count += counted[1]
 
     def on_train_batch_start(self, batch: Any, batch_idx: int) -> None:
         config, step = self.config, self.global_step
@@ -252,17 +253,17 @@ class Splat(PictureBackbone):
     @torch.no_grad()
     def _grow(self, step: int) -> None:
         config, grows = self.config, self.scheduled <= self.config.grow_until
-        push = self.push / self.seen.clamp_min(1)
-        normal = Draws(self.seed, step, self.device, stream="growth").normal(len(push), 6)
+        grad2d = self.grad2d / self.grad2d_count.clamp_min(1)
+        normal = Draws(self.seed, step, self.device, stream="growth").normal(len(grad2d), 6)
         threshold = config.threshold if grows else math.inf
-        change = densify(self.gaussians, push, threshold, self.extent, self.most, config.pruned, normal)
+        change = densify(self.gaussians, grad2d, threshold, self.extent, self.cap_max, config.pruned, normal)
         self._replace(change)
         if grows and config.reset_every and self.pace.passes(step, config.reset_every):
             self._reset()
         rewrap(self.trainer)
 
     def _replace(self, change: Change) -> None:
-        """Give the tables, and Adam's moments of them, other rows.
+        """Replace rows of the tables, and of Adam's moments.
 
         Each is a new parameter: where the graph of an earlier step still lives, it knows the old one's size.
         """
@@ -273,19 +274,19 @@ class Splat(PictureBackbone):
             for moment in ("exp_avg", "exp_avg_sq"):
                 if moment in state:
                     state[moment] = torch.cat([state[moment][change.kept], torch.zeros_like(added)])
-        self.push = torch.zeros(len(self.tables["means"]), device=self.device)
-        self.seen = torch.zeros_like(self.push)
+        self.grad2d = torch.zeros(len(self.tables["means"]), device=self.device)
+        self.grad2d_count = torch.zeros_like(self.grad2d)
 
     def _reset(self) -> None:
-        """Make all nearly transparent: what the pictures need comes back, what floats before cameras does not."""
+        """Make all nearly transparent: Gaussians that the pictures need regain opacity, floaters do not."""
         table = self.tables["opacities"]
-        table.clamp_(max=math.log(RESET / (1 - RESET)))
+        table.clamp_(max=math.log(RESET_OPACITY / (1 - RESET_OPACITY)))
         for moment in self.named_optimizers.state.get(table, {}).values():
             if isinstance(moment, Tensor):
                 moment.zero_()
 
     def stats(self) -> dict[str, float]:
-        return {"gaussians": float(len(self.push))}
+        return {"gaussians": float(len(self.grad2d))}
 
     # Checkpoints: their number changes in training, so that the tables are built anew before they are loaded.
 
@@ -296,9 +297,7 @@ class Splat(PictureBackbone):
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         super().on_load_checkpoint(checkpoint)
         count = len(checkpoint["state_dict"]["tables.means"])
-        for name, table in self.tables.items():
+        for table in self.tables.values():
             table.data = table.new_zeros(count, table.shape[1])
-            if len(checkpoint["state_dict"][f"tables.{name}"]) != count:
-                raise ValueError(f"{name} of another number of Gaussians than {count}")
-        self.push, self.seen = (table.new_zeros(count) for table in (self.push, self.seen))
+        self.grad2d, self.grad2d_count = (table.new_zeros(count) for table in (self.grad2d, self.grad2d_count))
         self.set_range(checkpoint["splat"]["low"], checkpoint["splat"]["range"])

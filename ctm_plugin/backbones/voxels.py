@@ -25,7 +25,7 @@ class VoxelField(OccupiedField):
         features: channels of the feature table.
         color: makes latents of features.
         direct: the features are latents themselves, before a sigmoid, and ``color`` is only kept.
-        threshold: see :class:`OccupiedField`.
+        alpha_thre: see :class:`OccupiedField`.
         step: distance between samples, in voxels or planes.
         shift: one number, or one a plane, ``[Z]``, between which it is interpolated.
 
@@ -34,10 +34,10 @@ class VoxelField(OccupiedField):
     """
 
     def __init__(
-        self, space: Box, shape: Shape, features: int, color: ViewMLP, *, direct: bool = False, threshold: float,
+        self, space: Box, shape: Shape, features: int, color: ViewMLP, *, direct: bool = False, alpha_thre: float,
         step: float, shift: Tensor | float,
     ):  # fmt: skip
-        super().__init__(space, VoxelGrid(space.box, shape), threshold)
+        super().__init__(space, VoxelGrid(space.aabb, shape), alpha_thre)
         self.color, self.direct, self.step, self.sparse = color, direct, step, False
         space.divide(step * space.spacing(shape))
         self.density = nn.Parameter(torch.zeros(self.grid.count, 1))
@@ -52,7 +52,7 @@ class VoxelField(OccupiedField):
         if not isinstance(self.vertex_shift, Tensor):
             return self.vertex_shift
         last = len(self.vertex_shift) - 1
-        position = ((points[:, 2] - self.grid.box[0, 2]) * self.grid.scale[2]).clamp(0, last)
+        position = ((points[:, 2] - self.grid.aabb[0, 2]) * self.grid.scale[2]).clamp(0, last)
         below = position.floor().clamp_max(last - 1)
         index = below.long()
         return torch.lerp(self.vertex_shift[index], self.vertex_shift[index + 1], position - below)
@@ -79,13 +79,13 @@ class VoxelField(OccupiedField):
 
     @torch.no_grad()
     def update_occupancy(self) -> None:
-        """Take vertices out whose neighbourhood has no alpha above the threshold."""
-        self.occupancy &= self.dilated_alpha() > self.threshold
+        """Take vertices out whose neighbourhood has no alpha above ``alpha_thre``."""
+        self.occupancy &= self.dilated_alpha() > self.alpha_thre
 
     @torch.no_grad()
     def resize(self, shape: Shape) -> None:
         """Resample both tables to other numbers of vertices; the parameters stay the same objects."""
-        old, new = self.grid, VoxelGrid(self.grid.box.cpu(), shape).to(self.density.device)
+        old, new = self.grid, VoxelGrid(self.grid.aabb.cpu(), shape).to(self.density.device)
         occupancy = self.occupancy[old.nearest(new.vertices())]
         for table in (self.density, self.features):
             table.data = resample(table.data, old.shape, shape)

@@ -1,107 +1,65 @@
-"""The colour transform as a Lightning callback, with its own optimizer."""
+"""A colour transform for a LightningModule of any program."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from typing import Any
 
 import lightning as L
-import torch
+from jaxtyping import Float
 from torch import Tensor
-from torch.optim import Adam, Optimizer
+from torch.optim import Optimizer
 
-from ctm_plugin.backbones.base import COLORS, Backbone
-from ctm_plugin.color.settings import TransformTraining
-from ctm_plugin.color.transform import ColorTransform, fitted
-from ctm_plugin.draws import Draws, seeded
-from ctm_plugin.errors import ConfigError
-from ctm_plugin.optim.schedules import Schedule, exponential
-
-PRETRAIN_COLORS = 1024
-"""Training colours in a step of pre-training, and as many random colours and random latents."""
+from ctm_plugin.color.prepare import adam_of, prepare
+from ctm_plugin.color.transform import ColorTransform
+from ctm_plugin.draws import Draws
+from ctm_plugin.errors import CTMError
+from ctm_plugin.optim.named_optimizers import NamedOptimizers, leave_out
+from ctm_plugin.optim.schedules import exponential
 
 
 class AttachTransform(L.Callback):
-    """Put a transform into a :class:`Backbone`, as part of its module tree, before weights are restored.
+    """Make a transform the module's ``transform``, fitted before the first step and trained by an Adam of its own.
 
-    Its parameters are then restored, moved and synchronised like any other; its optimizer is its own: an Adam named
-    ``ctm`` among the module's optimizers, stepped once a batch.
+    The module trains in its colours by :func:`ctm_plugin.front.losses` and shows what it renders by ``decode``. Its own
+    ``configure_optimizers`` stays as it is; both optimizers are stepped as one, so that accumulation, clipping,
+    precision and checkpoints are the Trainer's. This package's backbones get their transform when they are made.
 
     Args:
-        transform: of as many channels as the backbone renders.
-        training: how it is trained; not used for transforms without parameters.
+        transform: see :func:`ctm_plugin.front.transform`.
+        colors: sRGB in [0, 1], of training pixels, some ten thousand.
+        seed: of what is drawn from them.
     """
 
-    def __init__(self, transform: ColorTransform, training: TransformTraining | None = None):
-        self.transform = transform
-        self.training = training or TransformTraining()
+    def __init__(self, transform: ColorTransform, colors: Float[Tensor, "n 3"], seed: int = 0):
+        self.transform, self.colors, self.seed = transform, colors, seed
 
-    def setup(self, trainer: L.Trainer, pl_module: Backbone, stage: str) -> None:
-        self.attach(pl_module)
-
-    def attach(self, pl_module: Backbone) -> None:
-        """Put the transform in, and its optimizer among the module's.
-
-        Raises:
-            ConfigError: the backbone renders another number of channels.
-        """
-        if self.transform.channels != pl_module.channels:
-            raise ConfigError("ctm.k", self.transform.channels, f"{pl_module.channels}, the backbone's channels")
+    def setup(self, trainer: L.Trainer, pl_module: L.LightningModule, stage: str) -> None:
+        # In the module tree before weights are restored and before processes are joined.
         pl_module.transform = self.transform
-        if adam_of(self.transform, self.training):
-            pl_module.transform_optimizer = lambda transform: self._optimizer(transform, pl_module.schedule_steps)
+        if stage == "fit" and (adam := adam_of(self.transform)):
+            own = pl_module.configure_optimizers
+            pl_module.configure_optimizers = lambda: self._both(trainer, own(), adam)
 
-    def _optimizer(self, transform: ColorTransform, steps: int) -> tuple[Optimizer, Schedule]:
-        return adam_of(transform, self.training), exponential(self.training.lr_decay, steps)
+    def _both(self, trainer: L.Trainer, own: Any, adam: Optimizer) -> NamedOptimizers:
+        if not isinstance(own, Optimizer):
+            raise CTMError(f"configure_optimizers: found {type(own).__name__}, expected one optimizer, no scheduler")
+        leave_out(own, set(self.transform.parameters()))
+        falling = exponential(self.transform.learning.lr_decay, trainer.estimated_stepping_batches)
+        return NamedOptimizers({"field": own, "ctm": adam}, {"ctm": falling})
 
-    def on_train_start(self, trainer: L.Trainer, pl_module: Backbone) -> None:
-        # After the optimizers are restored, so that a resumed run knows that its transform is past pre-training.
-        if pl_module.batches_seen == 0:
-            adam = pl_module.named_optimizers.members.get("ctm")
-            prepare(self.transform, self.training, adam, pl_module.scene_colors, pl_module.seed, pl_module.device)
+    def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        if trainer.global_step == 0:  # else a checkpoint has what was found
+            colors = self.colors.to(pl_module.device)
+            members = getattr(trainer.optimizers[0], "members", {})
+            prepare(self.transform, members.get("ctm"), lambda *drawn: _of(colors, *drawn), self.seed, colors.device)
+
+    def on_train_batch_start(self, trainer: L.Trainer, *_: Any) -> None:
+        if isinstance(both := trainer.optimizers[0], NamedOptimizers):
+            both.set_rates(trainer.global_step)
+
+    def teardown(self, trainer: L.Trainer, pl_module: L.LightningModule, stage: str) -> None:
+        vars(pl_module).pop("configure_optimizers", None)
 
 
-def adam_of(transform: ColorTransform, training: TransformTraining) -> Adam | None:
-    """Make a transform's own optimizer; ``None`` where it has no parameters."""
-    parameters = list(transform.parameters())
-    return Adam(parameters, training.lr, training.betas, fused=True) if parameters else None
-
-
-def prepare(
-    transform: ColorTransform, training: TransformTraining, optimizer: Optimizer | None,
-    colors: Callable[[Draws, int], Tensor], seed: int, device: torch.device | str = "cpu",
-) -> None:  # fmt: skip
-    """Do what comes before a transform and a field are trained together: fit it to the scene, then pre-train it.
-
-    The latter minimises the cycle terms on training colours. All of it is the same on every process.
-
-    Args:
-        transform, training: what is to be trained, and how.
-        optimizer: the transform's own, of one parameter group; ``None`` where it has no parameters.
-        colors: ``colors(draws, count)``, ``[count, 3]``: random training colours as evaluation shows them.
-        seed, device: of the random numbers.
-
-    Raises:
-        ConfigError: all cycle terms weigh nothing.
-        CTMError: see :func:`ctm_plugin.color.transform.fitted`.
-    """
-    with seeded(seed):
-        fitted(transform, colors(Draws(seed, 0, device, stream="colors"), COLORS))
-    if optimizer is None:
-        return
-    (group,) = optimizer.param_groups
-    final, steps = group["lr"], training.pretrain_steps
-    first = training.pretrain_lr or final
-    falling = exponential(final / first, steps)
-    for step in range(steps):
-        group["lr"] = first * falling(step)
-        draws = Draws(seed, step, device, stream="pretraining")
-        with torch.no_grad():
-            rgb = colors(draws, PRETRAIN_COLORS)
-        loss = transform.cycle_loss(rgb, draws.uniform)
-        if not loss.requires_grad:
-            raise ConfigError("ctm.pretrain_steps", steps, "0 where the cycle terms img, rand and latent weigh nothing")
-        optimizer.zero_grad()
-        loss.backward()
-        optimizer.step()
-    group["lr"] = final
-    optimizer.zero_grad()
+def _of(colors: Tensor, draws: Draws, count: int) -> Tensor:
+    return colors[draws.integers(len(colors), count)]

@@ -20,6 +20,7 @@ from ctm_plugin.files import check_zip, replacing
 from ctm_plugin.settings.build import Config
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
+"""Signals after which a training saves and stops."""
 
 
 class CheckpointFile(TorchCheckpointIO):
@@ -107,7 +108,13 @@ class LastCheckpoint(L.Callback):
         self.stopped = trainer.strategy.reduce_boolean_decision(self.signalled, all=False)
         if self.stopped:
             trainer.should_stop = True
+            if pl_module.batches_seen % trainer.val_check_batch:  # else Lightning validates once more
+                trainer.limit_val_batches = 0
         if step > self.saved_at and (self.stopped or step % self.every == 0 or step == trainer.max_steps):
+            self.save(trainer)
+
+    def on_train_end(self, trainer: L.Trainer, pl_module: Backbone) -> None:
+        if trainer.global_step > self.saved_at:  # another callback has ended it
             self.save(trainer)
 
     def save(self, trainer: L.Trainer) -> None:

@@ -9,14 +9,14 @@ import lightning as L
 from ctm_plugin.backbones.base import Backbone
 from ctm_plugin.callbacks.stopwatch import Stopwatch
 
-MARKS = 20
-"""Parts of the time, and of the schedule, after each of which it looks at the clock."""
-LONGEST = 4
-"""Times its planned steps a schedule is stretched to at most: more teach next to nothing."""
-SHORTEST = 0.25
-"""Part of its planned steps that it is cut to at most: with fewer nothing is learned."""
-TOGETHER = 16
-"""Steps between looks of several processes, which wait for each other."""
+CLOCK_CHECKS = 20
+"""Number of times in a training that the schedule is compared with the clock."""
+MAX_STRETCH = 4
+"""Largest factor by which a schedule is stretched: more steps teach next to nothing."""
+MIN_STRETCH = 0.25
+"""Least factor to which a schedule is cut: with fewer steps nothing is learned."""
+SYNC_STEPS = 16
+"""Steps from one comparison of several processes' clocks to the next: they wait for each other."""
 
 
 class Deadline(L.Callback):
@@ -44,7 +44,7 @@ class Deadline(L.Callback):
 
     def on_train_batch_end(self, trainer: L.Trainer, pl_module: Backbone, *_: Any) -> None:
         together, step = trainer.world_size > 1, trainer.global_step
-        if not pl_module.between_steps or step >= trainer.max_steps or (together and step % TOGETHER):
+        if not pl_module.between_steps or step >= trainer.max_steps or (together and step % SYNC_STEPS):
             return
         # Of several processes the first one's clock counts.
         due = self._part(trainer, pl_module) > self.part
@@ -54,7 +54,7 @@ class Deadline(L.Callback):
 
     def _part(self, trainer: L.Trainer, module: Backbone) -> int:
         done = module.scheduled / module.schedule_steps
-        return int(MARKS * max(self.stopwatch.seconds / self.seconds, done))
+        return int(CLOCK_CHECKS * max(self.stopwatch.seconds / self.seconds, done))
 
     def _look(self, trainer: L.Trainer, module: Backbone) -> None:
         self.part, self.step, self.spent = self._part(trainer, module), trainer.global_step, self.stopwatch.seconds
@@ -64,6 +64,6 @@ class Deadline(L.Callback):
         here, before = pace.place(step), pace.place(self.step)
         each = (self.stopwatch.seconds - self.spent) / (step - self.step) / module.cost(before, here)
         steps = self.left / (each * module.cost(here, pace.planned))
-        least, most = (share * (pace.planned - here) for share in (SHORTEST, LONGEST))
-        pace.end_after(step, round(min(max(trainer.strategy.broadcast(steps), least), most)))
+        least, stretched = (share * (pace.planned - here) for share in (MIN_STRETCH, MAX_STRETCH))
+        pace.end_after(step, round(min(max(trainer.strategy.broadcast(steps), least), stretched)))
         trainer.fit_loop.epoch_loop.max_steps = pace.end

@@ -16,7 +16,9 @@ from ctm_plugin.files import replacing
 from ctm_plugin.show.pictures import write_png
 
 FRAME_MS = 200
-FAST = Image.Quantize.FASTOCTREE
+"""Milliseconds for which a frame of the film is shown."""
+PALETTE = Image.Quantize.FASTOCTREE
+"""Pillow's method of choosing a palette."""
 
 
 @dataclass(eq=False)
@@ -40,7 +42,7 @@ class Film(FilmConfig, L.Callback):
         folder = Path(trainer.default_root_dir, "film")
         frames = [to_8_bits(read_image(path)).numpy() for path in sorted(folder.glob("*.png"))]
         # A run's folder may hold others'. Of Pillow's ways to 256 colours the fastest, a tenth of the default's time.
-        shown = [Image.fromarray(frame).quantize(method=FAST) for frame in frames if frame.shape == frames[-1].shape]
+        shown = [Image.fromarray(frame).quantize(method=PALETTE) for frame in frames if frame.shape == frames[-1].shape]
         if shown:
             with replacing(folder.with_suffix(".gif")) as path:
                 shown[0].save(path, "GIF", save_all=True, append_images=shown[1:], duration=FRAME_MS, loop=0)

@@ -8,13 +8,14 @@ from typing import Any
 import lightning as L
 
 from ctm_plugin.backbones.posed import PosedBackbone
-from ctm_plugin.callbacks.dashboard import untouched
+from ctm_plugin.backbones.untouched import untouched
 from ctm_plugin.show.bars import say
 from ctm_plugin.show.pictures import beside, write_png
 
-SHARE = 0.1
-"""Of the schedule, after which there is something to see."""
+READY_AT = 0.1
+"""Share of the schedule after which the first picture is worth a look."""
 PREVIEW = "preview.png"
+"""Name of the preview's file in the run's folder."""
 
 
 class Preview(L.Callback):
@@ -22,10 +23,10 @@ class Preview(L.Callback):
 
     def on_train_batch_end(self, trainer: L.Trainer, pl_module: PosedBackbone, *_: Any) -> None:
         path = Path(trainer.default_root_dir, PREVIEW)
-        if trainer.is_global_zero and pl_module.scheduled >= SHARE * pl_module.schedule_steps and not path.exists():
-            light, photos = pl_module.light, pl_module.targets()
-            index = next((index for index, photo in enumerate(photos) if photo is not None), 0)
+        if trainer.is_global_zero and pl_module.scheduled >= READY_AT * pl_module.schedule_steps and not path.exists():
+            light, index = pl_module.light, pl_module.snapshots[0]
+            photo = pl_module.target(index)
             with untouched(pl_module):
                 rendered = pl_module.render_view(pl_module.scene.test, index)["rgb"].float().cpu()
-            write_png(path, beside(*(light.apply(each) for each in (rendered, photos[index]) if each is not None)))
+            write_png(path, beside(*(light.apply(each) for each in (rendered, photo) if each is not None)))
             say(f"preview: {path}")

@@ -28,8 +28,8 @@ class ProgressLine(L.Callback):
 
     def on_train_start(self, trainer: L.Trainer, pl_module: Backbone) -> None:
         self._last = (time.perf_counter(), trainer.global_step)
-        if trainer.is_global_zero and (found := pl_module.transform.describe()):
-            self.console.print(f"fitted to the scene's colours: {found}", highlight=False, markup=False)
+        if trainer.is_global_zero and (fit := pl_module.transform.describe()):
+            self.console.print(f"fitted to the scene's colours: {fit}", highlight=False, markup=False)
         if self.console.is_terminal and trainer.is_global_zero:
             shown = bar("training", pl_module.schedule_steps, int(pl_module.scheduled), self.console)
             self._shown = self._stack.enter_context(shown)

@@ -8,15 +8,6 @@ from ctm_plugin.settings.setting import Settings, setting
 
 
 @dataclass(eq=False)
-class DashboardConfig(Settings, section="callbacks.dashboard"):
-    """Curves every ``trainer.log_every`` steps; pictures before the first step, now and then, and at the end."""
-
-    image_every: int | None = setting(
-        None, "steps between pictures; null: no pictures", composed="${trainer.image_every}", least=1
-    )
-
-
-@dataclass(eq=False)
 class FilmConfig(Settings, section="callbacks.film"):
     """Pictures of the training, now and then, and a film of them at the end."""
 

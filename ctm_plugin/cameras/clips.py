@@ -9,19 +9,20 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32
 
-from ctm_plugin.cameras.photographs import PICTURES, below, home_of
-from ctm_plugin.data.readers.clip import CLIPS, CURVES, read_clip, watched, write_frames
+from ctm_plugin.cameras.photographs import PICTURE_SUFFIXES, below, home_of
+from ctm_plugin.data.readers.clip import CLIP_SUFFIXES, HDR_CURVES, read_clip, watched, write_frames
 from ctm_plugin.data.readers.folders import fold, is_picture, require_folder
 from ctm_plugin.errors import DataError
 from ctm_plugin.files import replacing_folder
 from ctm_plugin.show.bars import bar
 
-STILL = "a clip in which next to nothing moves", "one that goes around or past what it shows"
+STILL_CLIP = "a clip in which next to nothing moves", "one that goes around or past what it shows"
+"""What was found, and what was expected, where a clip hardly moves."""
 
 
 def is_clip(path: Path) -> bool:
     """Tell whether a file is a clip by its name; hidden ones are none."""
-    return path.suffix.lower() in CLIPS and not path.name.startswith(".")
+    return path.suffix.lower() in CLIP_SUFFIXES and not path.name.startswith(".")
 
 
 def root_of(given: Path) -> Path:
@@ -68,7 +69,7 @@ def take_frames(given: Path, pictures: str) -> Path:
             if numbers:
                 _write(clip, numbers, len(each.moved), folders[clip])
             else:
-                faults.append(DataError(clip, *STILL))
+                faults.append(DataError(clip, *STILL_CLIP))
         if faults and not any(map(is_picture, below(root))):
             raise faults[0]
         for fault in faults:
@@ -80,12 +81,12 @@ def folders_of_clips(given: Path, pictures: str) -> dict[Path, Path]:
     """Find the clips in a folder and those below it, and a folder for the frames of each."""
     root = require_folder(given, "a folder with photographs or clips, or a clip")
     files = below(root)
-    stills = {fold(str(path.with_suffix(""))) for path in files if path.suffix.lower() in PICTURES}
+    stills = {fold(str(path.with_suffix(""))) for path in files if path.suffix.lower() in PICTURE_SUFFIXES}
     clips = [path for path in files if is_clip(path)]
     live = [path for path in clips if fold(str(path.with_suffix(""))) in stills]
     if live:
-        told = f"{len(live)} clips with a still of the same name are left out, as {live[0].name!r}"
-        warnings.warn(f"{root}: {told}: Live Photos", stacklevel=3)
+        line = f"{len(live)} clips with a still of the same name are left out, as {live[0].name!r}"
+        warnings.warn(f"{root}: {line}: Live Photos", stacklevel=3)
     folders: dict[Path, Path] = {}
     home = home_of(root, pictures)
     for clip in (path for path in clips if path not in live):
@@ -109,5 +110,5 @@ def _write(clip: Path, numbers: list[int], count: int, folder: Path) -> None:
     except PermissionError as error:
         found = f"a folder that cannot be written to ({error.strerror})"
         raise DataError(folder.parent, found, f"a copy of {clip.name} in another: frames are written there") from error
-    turned = f", {CURVES[header.curve]} turned to sRGB" if header.curve else ""
+    turned = f", {HDR_CURVES[header.curve]} turned to sRGB" if header.curve else ""
     print(f"{clip.name}: {len(numbers)} of {count} frames, the sharpest on each stretch of the way{turned}: {folder}")

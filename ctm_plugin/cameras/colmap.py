@@ -18,25 +18,27 @@ import numpy as np
 import torch
 from jaxtyping import Float32
 
-from ctm_plugin.cameras.settings import FEWEST
+from ctm_plugin.cameras.settings import MIN_PICTURES
 from ctm_plugin.data.readers.picture import Header
 from ctm_plugin.errors import CTMError
 
 Reconstruction = Any
-"""pycolmap's, which is imported when it is asked for."""
+"""``pycolmap.Reconstruction``; ``pycolmap`` is imported only when it is used."""
 DATABASE = "database.db"
+"""Name of COLMAP's database in the working folder."""
 NEIGHBOURS = 10
-"""How far by name, in each direction, a picture of a long capture is compared; then 16, 32, 64, ... away."""
-USUAL = (100, 30, 16.0)
-"""COLMAP's own start: matches that the first two pictures need, and each other one; degrees between the first two."""
-FEWER, OTHER = (30, 15, 16.0), (30, 15, 6.0)
-"""For noisy pictures, and for what went astray: fewer matches, and first pictures that are nearer to one another."""
-LEAST_TRACK = 3
-"""Pictures that see a point which counts: two can agree on a place that is wrong."""
-CHUNK = 16
-"""Pairs of pictures between two looks at the progress bar."""
-DIAGONAL = 43.27
-"""Of a picture on 35 mm film, in millimetres."""
+"""Pictures of a long capture on each side, by name, that each is matched with; then those 16, 32, 64, ... away."""
+STANDARD = (100, 30, 16.0)
+"""COLMAP's own start: least matches of the first two pictures, of each other one, least degrees between the first
+two."""
+FEWER_MATCHES, CLOSER = (30, 15, 16.0), (30, 15, 6.0)
+"""Starts for noisy pictures and after a failed model: fewer matches, and a smaller angle between the first two."""
+MIN_TRACK = 3
+"""Least number of pictures that see a point which counts: two can agree on a place that is wrong."""
+PAIR_CHUNK = 16
+"""Pairs of pictures matched between two updates of the progress bar."""
+FILM_DIAGONAL = 43.27
+"""Diagonal of a picture on 35 mm film in millimetres."""
 
 
 class Features(NamedTuple):
@@ -94,7 +96,7 @@ class Workshop:
         database = colmap.Database.open(self.database)
         kinds = [(header.lens, header.height, header.width) for header in headers]
         numbers = {kind: number for number, kind in enumerate(dict.fromkeys(kinds), 1)}
-        for number, found in enumerate(features, begun + 1):
+        for number, feature in enumerate(features, begun + 1):
             header, camera_id = headers[number - 1], numbers[kinds[number - 1]]
             with colmap.DatabaseTransaction(database):
                 if not database.exists_camera(camera_id):
@@ -110,9 +112,9 @@ class Workshop:
                 frame = colmap.Frame(frame_id=number, rig_id=camera_id)
                 frame.add_data_id(image.data_id)
                 database.write_frame(frame, use_frame_id=True)
-                database.write_keypoints(number, found.places)
-                if not isinstance(found.descriptors, torch.Tensor):
-                    database.write_descriptors(number, found.descriptors)
+                database.write_keypoints(number, feature.places)
+                if not isinstance(feature.descriptors, torch.Tensor):
+                    database.write_descriptors(number, feature.descriptors)
         database.close()
 
     def match(
@@ -132,8 +134,8 @@ class Workshop:
         matching.num_threads, checking.ransac.random_seed = self.threads, self.seed
         listed = colmap.ImportedPairingOptions()
         listed.match_list_path = self.folder / "pairs.txt"
-        for start in range(0, len(pairs), CHUNK):
-            chunk = pairs[start : start + CHUNK]
+        for start in range(0, len(pairs), PAIR_CHUNK):
+            chunk = pairs[start : start + PAIR_CHUNK]
             listed.match_list_path.write_text("".join(f"{first} {second}\n" for first, second in chunk))
             if nearest is None:
                 colmap.match_image_pairs(self.database, matching, listed, checking, colmap.Device.cpu)
@@ -154,11 +156,11 @@ class Workshop:
     ) -> Reconstruction | None:
         """Place pictures one after the other: the model with most sights; ``None`` where not even two pictures fit.
 
-        ``start`` is as :data:`USUAL`; ``done`` is called with the number of pictures that have a place.
+        ``start`` is as :data:`STANDARD`; ``done`` is called with the number of pictures that have a place.
         """
         colmap = require_pycolmap()
         options = colmap.IncrementalPipelineOptions()
-        options.num_threads, options.min_model_size, options.extract_colors = self.threads, FEWEST, False
+        options.num_threads, options.min_model_size, options.extract_colors = self.threads, MIN_PICTURES, False
         mapper = options.mapper
         mapper.init_min_num_inliers, mapper.abs_pose_min_num_inliers, mapper.init_min_tri_angle = start
         for part in (options, options.mapper, options.triangulation):
@@ -174,22 +176,22 @@ class Workshop:
             done(standing[0])
 
         with tempfile.TemporaryDirectory(dir=self.folder) as models:
-            found = colmap.incremental_mapping(
+            mapped = colmap.incremental_mapping(
                 self.database, self.folder, models, options,
                 initial_image_pair_callback=first_two, next_image_callback=another,
             )  # fmt: skip
-        if not found:
+        if not mapped:
             return None
-        model = max(found.values(), key=lambda each: (sights(each), each.num_reg_images()))
+        model = max(mapped.values(), key=lambda each: (sights(each), each.num_reg_images()))
         for number in model.images:
             model.image(number).name = names[number - 1]
         return model
 
 
 def sights(model: Reconstruction) -> int:
-    """How often pictures see points that at least :data:`LEAST_TRACK` of them see."""
+    """How often pictures see points that at least :data:`MIN_TRACK` of them see."""
     lengths = (point.track.length() for point in model.points3D.values())
-    return sum(length for length in lengths if length >= LEAST_TRACK)
+    return sum(length for length in lengths if length >= MIN_TRACK)
 
 
 def adjust(model: Reconstruction, threads: int, tolerance: float = 1e-6) -> None:
@@ -224,7 +226,7 @@ def focal_length(header: Header) -> tuple[float, bool]:
     film = header.lens.film
     if film is None:
         return 1.2 * max(header.height, header.width), False
-    return film * math.hypot(header.height, header.width) / DIAGONAL, True
+    return film * math.hypot(header.height, header.width) / FILM_DIAGONAL, True
 
 
 def extract(picture: Float32[np.ndarray, "h w"], scale: int, pooled: bool) -> Features:
@@ -241,12 +243,12 @@ def extract(picture: Float32[np.ndarray, "h w"], scale: int, pooled: bool) -> Fe
     return Features(places, descriptors)
 
 
-def choose_pairs(count: int, most: int) -> list[tuple[int, int]]:
-    """Which of ``count`` pictures to compare: all with all up to ``most``, else neighbours in a ring; numbers from 1.
+def choose_pairs(count: int, max_pairs: int) -> list[tuple[int, int]]:
+    """Pairs of ``count`` pictures to match: all up to ``max_pairs``, else neighbours in a ring; numbers from 1.
 
     The ring closes captures that go round; steps that double tie passes to one another that lie far apart by name.
     """
-    if count <= most:
+    if count <= max_pairs:
         return list(combinations(range(1, count + 1), 2))
     steps = [*range(1, NEIGHBOURS + 1), *(2**power for power in range(4, count.bit_length()) if 2**power < count)]
     ring = {tuple(sorted((first, (first + step) % count))) for step in steps for first in range(count)}

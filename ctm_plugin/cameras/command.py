@@ -13,7 +13,7 @@ from pathlib import Path
 from ctm_plugin import __version__
 from ctm_plugin.cameras.clips import take_frames
 from ctm_plugin.cameras.colmap import Reconstruction, require_pycolmap
-from ctm_plugin.cameras.photographs import MODEL, added, home_of, list_photographs
+from ctm_plugin.cameras.photographs import MODEL_FOLDER, added, home_of, list_photographs
 from ctm_plugin.cameras.raws import develop_raws
 from ctm_plugin.cameras.search import find_cameras
 from ctm_plugin.cameras.settings import CamerasConfig
@@ -25,12 +25,13 @@ from ctm_plugin.errors import DataError
 from ctm_plugin.files import replacing_folder
 from ctm_plugin.show.console import output_console, print_next, table_for
 
-FEW_SIGHTS = 100
-"""Of a mean picture: places of a noisy capture with 49 were off by 4.8 % in the median, 26 % at most."""
-KEPT, KEY = ".ctm_cameras", "search.json"
-"""The folder, next to the photographs' one, for what a search has done that was stopped; and what it was."""
-TOLD = 5
-"""Names of pictures in a message, at most."""
+FEW_OBSERVATIONS = 100
+"""Observations a picture below which a model is warned of: with 49, cameras of a noisy capture were off by 4.8 % in the
+median, 26 % at most, before they were refined."""
+KEPT_FOLDER, KEY = ".ctm_cameras", "search.json"
+"""Folder inside the capture for what a stopped search has done, and the file in it that says which search it was."""
+MAX_NAMES = 5
+"""Most names of pictures in a message."""
 
 
 def cameras(folder: Path, settings: CamerasConfig) -> None:
@@ -56,24 +57,27 @@ def place(folder: Path, settings: CamerasConfig) -> tuple[list[str], Trusted, fl
     paths = list_photographs(root, settings.pictures)
     pictures, home = [read_picture(path) for path in paths], home_of(root, settings.pictures)
     names = [path.relative_to(home).as_posix() for path in paths]
-    for there in (root / MODEL, root / MODEL.parent / "cameras.bin"):
+    for there in (root / MODEL_FOLDER, root / MODEL_FOLDER.parent / "cameras.bin"):
         if not settings.overwrite and (there.exists() or there.is_symlink()):
             more = added(root, settings.pictures)
             since = f", and {len(more)} photographs that were added since" if more else ""
             raise DataError(there, f"cameras that are there already{since}", "none, or overwrite=true to replace them")
     require_pycolmap()
     try:
-        with replacing_folder(root / MODEL) as target, kept(root / KEPT, key_of(paths, settings)) as folder:
-            found, gain = find_cameras(pictures, names, settings, folder)
-            found.model.extract_colors_for_all_images(home)
-            found.model.write_binary(target)
+        with (
+            replacing_folder(root / MODEL_FOLDER) as target,
+            kept(root / KEPT_FOLDER, key_of(paths, settings)) as folder,
+        ):
+            trusted, gain = find_cameras(pictures, names, settings, folder)
+            trusted.model.extract_colors_for_all_images(home)
+            trusted.model.write_binary(target)
             mark_as_shown(target, names)
     except KeyboardInterrupt:
         raise KeyboardInterrupt("stopped; what was done is kept") from None
     except PermissionError as error:
-        found = f"a folder that cannot be written to ({error.strerror})"
-        raise DataError(root, found, "a copy of it: cameras are written next to the photographs") from error
-    return names, found, gain
+        trusted = f"a folder that cannot be written to ({error.strerror})"
+        raise DataError(root, trusted, "a copy of it: cameras are written next to the photographs") from error
+    return names, trusted, gain
 
 
 @contextmanager
@@ -97,32 +101,32 @@ def key_of(paths: Sequence[Path], settings: CamerasConfig) -> str:
     return json.dumps([__version__, asdict(replace(settings, overwrite=False, threads=1)), files])
 
 
-def tell(root: Path, names: Sequence[str], found: Trusted, gain: float) -> None:
+def tell(root: Path, names: Sequence[str], trusted: Trusted, gain: float) -> None:
     """Print what was found, where it is and how to go on."""
-    model = found.model
+    model = trusted.model
     placed = {model.image(number).name for number in model.reg_image_ids()}
     console = output_console()
     table = table_for(console, show_header=False)
     table.add_row("pictures", f"{len(placed)} of {len(names)}")
-    few = "" if found.mean >= FEW_SIGHTS else ", few: places may be off by some percent"
-    table.add_row("points", f"{model.num_points3D()}; a mean picture sees {found.mean:.0f} that two others see{few}")
+    few = "" if trusted.mean >= FEW_OBSERVATIONS else ", few: places may be off by some percent"
+    table.add_row("points", f"{model.num_points3D()}; a mean picture sees {trusted.mean:.0f} that two others see{few}")
     table.add_row("reprojection error", f"{model.compute_mean_reprojection_error():.2f} pixels (mean)")
-    for told in focal_lengths(model):
-        table.add_row("focal length", told)
+    for text in focal_lengths(model):
+        table.add_row("focal length", text)
     table.add_row("brightened", f"{gain:.1f} times" if gain > 1 else "not at all")
     console.print(table)
     if left := [name for name in names if name not in placed]:
-        told = ", ".join(left[:TOLD]) + ", ..." * (len(left) > TOLD)
-        console.print(f"not placed, and not trained on: {told}", soft_wrap=True, highlight=False, markup=False)
-    console.print(f"written to {root / MODEL}", soft_wrap=True, highlight=False, markup=False)
+        text = ", ".join(left[:MAX_NAMES]) + ", ..." * (len(left) > MAX_NAMES)
+        console.print(f"not placed, and not trained on: {text}", soft_wrap=True, highlight=False, markup=False)
+    console.print(f"written to {root / MODEL_FOLDER}", soft_wrap=True, highlight=False, markup=False)
 
 
 def focal_lengths(model: Reconstruction) -> list[str]:
     """Tell the focal length of each camera, and of how many pictures it is where there are several cameras."""
     counts = Counter(model.image(number).camera_id for number in model.reg_image_ids()).most_common()
-    told = []
-    for number, count in counts[:TOLD]:
+    text = []
+    for number, count in counts[:MAX_NAMES]:
         camera = model.cameras[number]
         whose = f", in {count} pictures" if len(counts) > 1 else ""
-        told.append(f"{camera.mean_focal_length():.1f} pixels of {camera.width}x{camera.height}{whose}")
-    return [*told, f"and {len(counts) - TOLD} others: lenses or sizes differ"] if len(counts) > TOLD else told
+        text.append(f"{camera.mean_focal_length():.1f} pixels of {camera.width}x{camera.height}{whose}")
+    return [*text, f"and {len(counts) - MAX_NAMES} others: lenses or sizes differ"] if len(counts) > MAX_NAMES else text

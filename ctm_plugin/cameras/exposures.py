@@ -9,11 +9,11 @@ import numpy as np
 import torch
 from jaxtyping import Float64, Int64
 
-from ctm_plugin.cameras.colmap import LEAST_TRACK, require_pycolmap
-from ctm_plugin.cameras.photographs import MODEL, home_of
+from ctm_plugin.cameras.colmap import MIN_TRACK, require_pycolmap
+from ctm_plugin.cameras.photographs import MODEL_FOLDER, home_of
 from ctm_plugin.cameras.refine import looked_up
 from ctm_plugin.cameras.search import read_light
-from ctm_plugin.cameras.settings import USUAL
+from ctm_plugin.cameras.settings import DEFAULT_FOLDER
 from ctm_plugin.data.readers.colmap_model import is_as_shown
 from ctm_plugin.data.readers.images import read_picture
 
@@ -23,7 +23,7 @@ SIZE = 300
 """Longest side of the copies in which light is looked up: a pixel there is the mean of many."""
 DARKEST, BRIGHTEST = 1e-5, 0.8
 """Linear light that tells something: neither black nor cut off."""
-FEWEST_SEEN = 20
+MIN_POINTS = 20
 """How many points tell a photograph's gain."""
 ROUNDS = 10
 
@@ -33,14 +33,14 @@ def spread_of_gains(root: Path) -> float:
 
     Only where ``ctm cameras`` found the cameras of ``root``; else 0.
     """
-    if not (is_as_shown(root / MODEL) and find_spec("pycolmap")):
+    if not (is_as_shown(root / MODEL_FOLDER) and find_spec("pycolmap")):
         return 0.0
-    model, home = require_pycolmap().Reconstruction(root / MODEL), home_of(root, USUAL)
+    model, home = require_pycolmap().Reconstruction(root / MODEL_FOLDER), home_of(root, DEFAULT_FOLDER)
     levels, views, points = [], [], []
     for view in model.reg_image_ids():
         image = model.image(view)
         seen = [each for each in image.points2D if each.has_point3D()]
-        seen = [each for each in seen if model.points3D[each.point3D_id].track.length() >= LEAST_TRACK]
+        seen = [each for each in seen if model.points3D[each.point3D_id].track.length() >= MIN_TRACK]
         light, scale = read_light(read_picture(home / image.name), SIZE)
         places = torch.from_numpy(np.array([each.xy for each in seen], np.float32).reshape(-1, 1, 2)) / scale
         level = looked_up(light, places)[0][:, 0].double().numpy()
@@ -58,7 +58,7 @@ def log_gains(
     """Natural logarithms of the views' gains, but for what they have in common, out of logarithms of light.
 
     ``levels = gain of the view + light of the point``, each in turn the median of what the other leaves. Views with
-    fewer than :data:`FEWEST_SEEN` points are left out.
+    fewer than :data:`MIN_POINTS` points are left out.
     """
     _, views, counts = np.unique(views, return_inverse=True, return_counts=True)
     _, points = np.unique(points, return_inverse=True)
@@ -67,7 +67,7 @@ def log_gains(
         lights = medians(levels - gains[views], points)
         gains = medians(levels - lights[points], views)
         gains -= gains.mean() if len(gains) else 0.0
-    return gains[counts >= FEWEST_SEEN]
+    return gains[counts >= MIN_POINTS]
 
 
 def medians(values: Float64[np.ndarray, " o"], groups: Int64[np.ndarray, " o"]) -> Float64[np.ndarray, " g"]:

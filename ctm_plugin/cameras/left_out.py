@@ -12,21 +12,22 @@ from typing import NamedTuple
 
 from PIL.ExifTags import Base
 
-from ctm_plugin.data.readers.folders import PHONES, fold
+from ctm_plugin.data.readers.folders import PHONE_SUFFIXES, fold
 from ctm_plugin.data.readers.images import DECODERS, open_usual, opened, read_picture
 from ctm_plugin.errors import CTMError
 
-KINDS = (".exr", ".tif", ".tiff", *PHONES, ".png", ".webp", ".jpg", ".jpeg")
-"""Which of several files of one photograph is taken: the first of these."""
-PANORAMA = 2.0
-"""Longer side by shorter one, of a panorama at least, where the pictures next to it are none."""
-WIDER = 1.4
-"""By how much a panorama is longer than the pictures next to it."""
-FEW = 0.25
-"""Screenshots are fewer of the pictures in a folder."""
+SUFFIX_ORDER = (".exr", ".tif", ".tiff", *PHONE_SUFFIXES, ".png", ".webp", ".jpg", ".jpeg")
+"""Suffixes in order of preference, where several files hold one photograph."""
+PANORAMA_ASPECT = 2.0
+"""Least ratio of longer to shorter side of a panorama, where the pictures next to it are none."""
+PANORAMA_EXCESS = 1.4
+"""Least ratio of a panorama's aspect to that of the pictures next to it."""
+MAX_SCREENSHOTS = 0.25
+"""Largest share of a folder's pictures that may be screenshots."""
 DEVELOPED = "developed"
-"""The folder next to raw pictures for what is made of them."""
-SCREEN = re.compile(r"screen[ _-]?(shot|capture)|bildschirmfoto", re.IGNORECASE)
+"""Name of the folder, next to raw pictures, that holds the developed ones."""
+SCREENSHOT_NAME = re.compile(r"screen[ _-]?(shot|capture)|bildschirmfoto", re.IGNORECASE)
+"""Names of screenshots."""
 
 
 class Looks(NamedTuple):
@@ -64,19 +65,19 @@ def looks_of(path: Path) -> Looks | None:
 def left_out(paths: Sequence[Path]) -> dict[str, list[Path]]:
     """Find pictures that are no photographs of their own, by what they are.
 
-    - copies: a file with the same bytes is there, or the same photograph under another suffix (``KINDS``);
+    - copies: a file with the same bytes is there, or the same photograph under another suffix (``SUFFIX_ORDER``);
     - screenshots: called so, or by no camera and of a size that no photograph has, next to photographs by cameras;
-    - panoramas: ``PANORAMA`` times as long as high, next to pictures that are not nearly.
+    - panoramas: ``PANORAMA_ASPECT`` times as long as high, next to pictures that are not nearly.
     """
     pictures = [looks for path in paths if (looks := looks_of(path))]
-    found: dict[str, list[Path]] = {}
+    reasons: dict[str, list[Path]] = {}
     rules: tuple[tuple[str, Callable[[list[Looks]], Iterable[Path]]], ...]
     rules = (("copies", copies), ("screenshots", by_folder(screenshots)), ("panoramas", by_folder(panoramas)))
     for what, rule in rules:
         if hits := list(rule(pictures)):
-            found[what] = hits
+            reasons[what] = hits
             pictures = [each for each in pictures if each.path not in hits]
-    return found
+    return reasons
 
 
 def copies(pictures: Sequence[Looks]) -> list[Path]:
@@ -94,22 +95,22 @@ def copies(pictures: Sequence[Looks]) -> list[Path]:
         folder = each.path.parent.parent if each.path.parent.name == DEVELOPED else each.path.parent
         names[fold(str(folder / each.path.stem)), round(each.ratio, 1)].append(each.path)
     for alike in names.values():
-        hits += sorted(alike, key=lambda path: KINDS.index(path.suffix.lower()))[1:]
+        hits += sorted(alike, key=lambda path: SUFFIX_ORDER.index(path.suffix.lower()))[1:]
     return hits
 
 
 def screenshots(pictures: Sequence[Looks]) -> list[Path]:
     """Pictures called so; others that no camera took, where they are few and of a size that no photograph has."""
-    called = [each.path for each in pictures if SCREEN.search(each.path.name)]
+    called = [each.path for each in pictures if SCREENSHOT_NAME.search(each.path.name)]
     sizes = {each.sides for each in pictures if each.camera}
     other = [each.path for each in pictures if sizes and not each.camera and each.sides not in sizes]
-    few = len(other) < FEW * len(pictures)
+    few = len(other) < MAX_SCREENSHOTS * len(pictures)
     return [each.path for each in pictures if each.path in called or (few and each.path in other)]
 
 
 def panoramas(pictures: Sequence[Looks]) -> list[Path]:
     usual = median(each.ratio for each in pictures)
-    return [each.path for each in pictures if each.ratio >= max(PANORAMA, WIDER * usual)]
+    return [each.path for each in pictures if each.ratio >= max(PANORAMA_ASPECT, PANORAMA_EXCESS * usual)]
 
 
 def by_folder(rule: Callable[[list[Looks]], list[Path]]) -> Callable[[list[Looks]], list[Path]]:

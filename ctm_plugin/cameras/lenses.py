@@ -10,11 +10,11 @@ from jaxtyping import Float64
 
 from ctm_plugin.cameras.colmap import Reconstruction, adjust, require_pycolmap
 
-APART = 1.15
+MIN_RATIO = 1.15
 """Ratio of two lenses' focal lengths, at least. Measured: one lens's are within 1.04, in noise 1.25 without a gap."""
-ALIKE = 0.25
+MAX_SPREAD = 0.25
 """Of the distance between two lenses, in logarithms: how far one lens's focal lengths may spread."""
-FEWEST_OF_A_LENS = 3
+MIN_PICTURES_OF_A_LENS = 3
 
 
 def tell_lenses_apart(
@@ -56,9 +56,9 @@ def lenses(focal: Float64[np.ndarray, " n"]) -> list[list[int]]:
     order = np.argsort(focal)
     logs = np.log(focal[order])
     steps = np.diff(logs)
-    groups = np.split(np.arange(len(focal)), np.flatnonzero(steps > np.log(APART)) + 1)
-    far = min(steps[steps > np.log(APART)], default=0.0)
-    clear = all(len(group) >= FEWEST_OF_A_LENS and np.ptp(logs[group]) < ALIKE * far for group in groups)
+    groups = np.split(np.arange(len(focal)), np.flatnonzero(steps > np.log(MIN_RATIO)) + 1)
+    far = min(steps[steps > np.log(MIN_RATIO)], default=0.0)
+    clear = all(len(group) >= MIN_PICTURES_OF_A_LENS and np.ptp(logs[group]) < MAX_SPREAD * far for group in groups)
     return [order[group].tolist() for group in groups] if clear else [order.tolist()]
 
 

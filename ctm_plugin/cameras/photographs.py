@@ -9,29 +9,31 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from ctm_plugin.cameras.left_out import left_out
-from ctm_plugin.cameras.settings import FEWEST, USUAL
-from ctm_plugin.data.readers.clip import CLIPS
+from ctm_plugin.cameras.settings import DEFAULT_FOLDER, MIN_PICTURES
+from ctm_plugin.data.readers.clip import CLIP_SUFFIXES
 from ctm_plugin.data.readers.colmap_model import searched_in
-from ctm_plugin.data.readers.folders import FOREIGN, IMAGE_SUFFIXES, RAWS, is_picture, others_hint
+from ctm_plugin.data.readers.folders import IMAGE_SUFFIXES, RAW_SUFFIXES, UNREAD_SUFFIXES, is_picture, others_hint
 from ctm_plugin.errors import DataError
 
-MODEL = Path("sparse", "0")
-"""Where ``ctm cameras`` writes."""
-PICTURES = (*IMAGE_SUFFIXES, *FOREIGN, *RAWS)
-APART = re.compile(r"\..*|(images?_)?masks?|masks_\d+|depths?|sparse|colmap\w*|runs|left_out", re.IGNORECASE)
-"""Folders that hold no photographs of their own."""
-NUMBERS = re.compile(r"(\d+)").split
-SYSTEMS = ("Thumbs.db", "desktop.ini")
-"""What Windows leaves in folders."""
+MODEL_FOLDER = Path("sparse", "0")
+"""Folder inside the capture that ``ctm cameras`` writes its model to."""
+PICTURE_SUFFIXES = (*IMAGE_SUFFIXES, *UNREAD_SUFFIXES, *RAW_SUFFIXES)
+"""Suffixes of pictures, those that are read and those that are only named in a message."""
+NO_PHOTOGRAPHS = re.compile(r"\..*|(images?_)?masks?|masks_\d+|depths?|sparse|colmap\w*|runs|left_out", re.IGNORECASE)
+"""Names of folders that hold no photographs of their own."""
+SPLIT_DIGITS = re.compile(r"(\d+)").split
+"""Splits a name at its numbers, so that 2 sorts before 10."""
+SYSTEM_FILES = ("Thumbs.db", "desktop.ini")
+"""Files that Windows leaves in folders."""
 
 
 def below(folder: Path) -> list[Path]:
-    """The files of a folder and of those in it, by names, numbers as they count; not those in folders ``APART``."""
-    found = []
+    """The files of a folder and its folders in natural order; those of ``NO_PHOTOGRAPHS`` are left out."""
+    files = []
     for place, folders, names in os.walk(folder, followlinks=True):
-        folders[:] = [name for name in folders if not APART.fullmatch(name)]
-        found += [Path(place, name) for name in names if not name.startswith(".")]
-    return sorted(found, key=lambda path: [int(part) if part.isdecimal() else part for part in NUMBERS(str(path))])
+        folders[:] = [name for name in folders if not NO_PHOTOGRAPHS.fullmatch(name)]
+        files += [Path(place, name) for name in names if not name.startswith(".")]
+    return sorted(files, key=lambda path: [int(part) if part.isdecimal() else part for part in SPLIT_DIGITS(str(path))])
 
 
 def home_of(root: Path, name: str) -> Path:
@@ -39,8 +41,8 @@ def home_of(root: Path, name: str) -> Path:
     folder with some, else ``root``.
     """
     place = root / name
-    elsewhere = name == USUAL and not place.is_dir()
-    homes = [path.parent for path in below(root) if path.suffix.lower() in PICTURES] if elsewhere else []
+    elsewhere = name == DEFAULT_FOLDER and not place.is_dir()
+    homes = [path.parent for path in below(root) if path.suffix.lower() in PICTURE_SUFFIXES] if elsewhere else []
     return Path(root, *Path(os.path.commonpath(homes)).relative_to(root).parts[:1]) if homes else place
 
 
@@ -52,10 +54,10 @@ def list_photographs(root: Path, name: str) -> list[Path]:
     for what, others in left_out(paths).items():
         warnings.warn(f"{place}: {len(others)} {what} are left out, as {others[0].name!r}", stacklevel=2)
         paths = [path for path in paths if path not in others]
-    if len(paths) < FEWEST:
+    if len(paths) < MIN_PICTURES:
         raise too_few(root, place, files, len(paths))
-    known = (*IMAGE_SUFFIXES, *CLIPS, *RAWS)
-    left = [path for path in files if path.suffix.lower() not in known and path.name not in SYSTEMS]
+    known = (*IMAGE_SUFFIXES, *CLIP_SUFFIXES, *RAW_SUFFIXES)
+    left = [path for path in files if path.suffix.lower() not in known and path.name not in SYSTEM_FILES]
     if left:
         warnings.warn(f"{place}: {len(left)} other files are left out, as {left[0].name!r}", stacklevel=2)
     return paths
@@ -63,7 +65,7 @@ def list_photographs(root: Path, name: str) -> list[Path]:
 
 def added(root: Path, name: str) -> list[str]:
     """Which photographs were not there when ``ctm cameras`` searched for the cameras of ``root``."""
-    there, home = searched_in(root / MODEL), home_of(root, name)
+    there, home = searched_in(root / MODEL_FOLDER), home_of(root, name)
     names = [path.relative_to(home).as_posix() for path in list_photographs(root, name)] if there else []
     return [each for each in names if each not in there]
 
@@ -73,8 +75,8 @@ def too_few(root: Path, place: Path, files: Sequence[Path], count: int) -> DataE
     if not place.is_dir():
         there = ", ".join(sorted(path.name for path in root.iterdir() if path.is_dir())) or "no folders"
         return DataError(root, there, f"photographs in {place.name}; for others, ctm cameras FOLDER pictures=NAME")
-    foreign = [path for path in files if path.suffix.lower() in FOREIGN]
-    expected = f"at least {FEWEST} ending in {', '.join(IMAGE_SUFFIXES)}"
+    foreign = [path for path in files if path.suffix.lower() in UNREAD_SUFFIXES]
+    expected = f"at least {MIN_PICTURES} ending in {', '.join(IMAGE_SUFFIXES)}"
     if foreign:
         expected += f"; {others_hint(foreign)}"
     return DataError(place, f"{count} pictures", expected)

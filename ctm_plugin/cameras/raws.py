@@ -11,15 +11,15 @@ import tifffile
 
 from ctm_plugin.cameras.left_out import DEVELOPED
 from ctm_plugin.cameras.photographs import below
-from ctm_plugin.data.readers.folders import RAWS
+from ctm_plugin.data.readers.folders import RAW_SUFFIXES
 from ctm_plugin.data.readers.images import read_picture
 from ctm_plugin.data.readers.raw import RawHeader, open_raw, read_raw
 from ctm_plugin.errors import DataError
 from ctm_plugin.files import replacing
 from ctm_plugin.show.bars import bar
 
-HALVED = 3000
-"""Longer side from which half of the sensor's pixels each way are enough."""
+HALF_SIZE_SIDE = 3000
+"""Longer side in pixels from which a raw picture is developed at half its size."""
 
 
 def develop_raws(root: Path) -> None:
@@ -65,12 +65,12 @@ def develop_raws(root: Path) -> None:
 
 def is_raw(path: Path) -> bool:
     """Tell whether a file is a raw picture by its name."""
-    return path.suffix.lower() in RAWS
+    return path.suffix.lower() in RAW_SUFFIXES
 
 
 def _develop(path: Path, target: Path, header: RawHeader, brightness: float, balance: tuple[float, ...]) -> None:
     def decode(path: Path) -> object:
-        return open_raw(path, brightness, balance, header.side > HALVED)
+        return open_raw(path, brightness, balance, header.side > HALF_SIZE_SIDE)
 
     codes = read_picture(path, decode).image().numpy()
     turned = [(274, "H", 1, header.orientation, True)]

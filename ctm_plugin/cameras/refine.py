@@ -12,18 +12,18 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float32, Int64
 from torch import Tensor
 
-from ctm_plugin.cameras.colmap import LEAST_TRACK, Reconstruction, adjust, require_pycolmap
+from ctm_plugin.cameras.colmap import MIN_TRACK, Reconstruction, adjust, require_pycolmap
 from ctm_plugin.show.bars import Update
 
 BLUR = 0.15
 """Of a patch's reach: the Gaussian that pictures are blurred with."""
 STEPS = 2
 """Moves of each patch before cameras are adjusted."""
-MOST_STEP, MOST_MOVE = 1.5, 4.0
+MAX_STEP, MAX_MOVE = 1.5, 4.0
 """Pixels that a patch may move at a time, and from where its point should be seen; COLMAP's own bound for points."""
-LEAST_ANGLE = 1.5
+MIN_ANGLE = 1.5
 """Degrees between two rays to a point; COLMAP's own bound."""
-MOST_DOUBT = 0.5
+MAX_DOUBT = 0.5
 """Pixels of standard deviation, by the noise, of a place that counts."""
 
 
@@ -71,7 +71,7 @@ def refine(model: Reconstruction, lights: Sequence[Light], reach: int, rounds: i
         done: called with how many rounds there were.
     """
     colmap = require_pycolmap()
-    for point in [number for number, each in model.points3D.items() if each.track.length() < LEAST_TRACK]:
+    for point in [number for number, each in model.points3D.items() if each.track.length() < MIN_TRACK]:
         model.delete_point3D(point)
     even, scales = {}, {}
     for view in model.reg_image_ids():
@@ -86,7 +86,7 @@ def refine(model: Reconstruction, lights: Sequence[Light], reach: int, rounds: i
                 elif model.exists_point3D(numbers[row]):
                     model.delete_observation(view, index)
         adjust(model, threads)
-        colmap.ObservationManager(model).filter_all_points3D(MOST_MOVE * max(scales.values()), LEAST_ANGLE)
+        colmap.ObservationManager(model).filter_all_points3D(MAX_MOVE * max(scales.values()), MIN_ANGLE)
         done(number + 1)
     model.update_point_3d_errors()
 
@@ -145,15 +145,15 @@ def moved(
             normal.diagonal(dim1=-2, dim2=-1).clamp_(min=1e-12)
             rest = others - looks[view]
             doubt = (rest**2 @ weight) / (torch.linalg.eigvalsh(normal)[:, 0] * bell.sum())
-            sure[view] = inside[view] & (times[sights.rows] >= LEAST_TRACK) & (doubt < MOST_DOUBT**2)
+            sure[view] = inside[view] & (times[sights.rows] >= MIN_TRACK) & (doubt < MAX_DOUBT**2)
             step = torch.linalg.solve_ex(normal, slope.mT @ (weight * rest)[..., None])[0]
             step = (step.mT @ sights.axes)[:, 0]  # from the point's own picture into this one
-            moves[view] += step.nan_to_num().clamp(-MOST_STEP, MOST_STEP)
+            moves[view] += step.nan_to_num().clamp(-MAX_STEP, MAX_STEP)
     return {
         view: (
             sights,
             (sights.middles + moves[view]).double().numpy(),
-            (sure[view] & (moves[view].norm(dim=-1) < MOST_MOVE)).tolist(),
+            (sure[view] & (moves[view].norm(dim=-1) < MAX_MOVE)).tolist(),
         )
         for view, sights in seen.items()
     }

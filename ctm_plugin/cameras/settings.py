@@ -7,11 +7,12 @@ from pathlib import Path
 
 from ctm_plugin.settings.setting import Settings, setting
 
-FEWEST = 3
-"""Pictures of a model, at least, as the loaders want."""
-USUAL = "images"
-"""The folder of the photographs, by default."""
-LENSES = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
+MIN_PICTURES = 3
+"""Least number of pictures of a model, as the loaders want."""
+DEFAULT_FOLDER = "images"
+"""Name of the photographs' folder, by default."""
+CAMERA_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
+"""COLMAP's camera models that may be asked for."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -19,7 +20,7 @@ class CamerasConfig(Settings):
     """How to look for cameras."""
 
     pictures: str = setting(
-        USUAL,
+        DEFAULT_FOLDER,
         "folder in FOLDER with the photographs and no other pictures; images is looked for elsewhere if not there",
     )
     brighten: bool = setting(
@@ -33,12 +34,12 @@ class CamerasConfig(Settings):
     all_pairs: int = setting(
         150,
         "up to this many pictures, each is compared with all others; more are compared with their neighbours by name",
-        least=FEWEST,
+        least=MIN_PICTURES,
     )
     lens: str = setting(
         "SIMPLE_RADIAL",
         "COLMAP's model of the cameras: SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL or OPENCV",
-        choices=LENSES,
+        choices=CAMERA_MODELS,
     )
     overwrite: bool = setting(False, "replace cameras that are in the folder already")
     seed: int = setting(0, "seed of COLMAP's random numbers", least=0)

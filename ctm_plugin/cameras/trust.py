@@ -11,11 +11,11 @@ from jaxtyping import Bool, Float64
 
 from ctm_plugin.cameras.colmap import Reconstruction, require_pycolmap, sights
 
-MOST_ERROR = 4.0
-"""Pixels between a match and the line that its cameras draw for it; COLMAP's own bound for matches of two pictures."""
-LEAST_SHARE = 0.7
-"""Of a picture's matches that its place must explain. Measured: 0.81 and more where places are right, 0.54 and less
-where one is off by a third of the extent."""
+MAX_ERROR = 4.0
+"""Largest distance in pixels between a match and its epipolar line; COLMAP's own bound for two pictures."""
+MIN_INLIERS = 0.7
+"""Least share of a picture's matches that its camera must explain. Measured: 0.81 and more where cameras are right,
+0.54 and less where one is off by a third of the extent."""
 
 
 class Trusted(NamedTuple):
@@ -43,7 +43,7 @@ def trusted(model: Reconstruction | None, database: Path) -> Trusted:
     """Take out of a model what contradicts the matches in its ``database``, and count what holds the rest."""
     if model is None:
         return Trusted()
-    wrong = [number for number, share in shares(model, database).items() if share < LEAST_SHARE]
+    wrong = [number for number, share in shares(model, database).items() if share < MIN_INLIERS]
     for number in wrong:
         model.deregister_frame(model.image(number).frame_id)
     return Trusted(model, model.num_reg_images(), len(wrong), sights(model))
@@ -83,7 +83,7 @@ def explained(
 ) -> Bool[np.ndarray, " n"]:  # fmt: skip
     """Whether two cameras may see the same points on rays ``[N, 3]`` (x, y, 1), in their own axes.
 
-    Sampson's distance to the epipolar lines is at most :data:`MOST_ERROR` pixels (Hartley and Zisserman, Multiple View
+    Sampson's distance to the epipolar lines is at most :data:`MAX_ERROR` pixels (Hartley and Zisserman, Multiple View
     Geometry, 11.4.3). Poses ``[3, 4]`` are from world to camera, focal lengths in pixels.
     """
     turn = other[:, :3] @ pose[:, :3].T
@@ -91,4 +91,4 @@ def explained(
     essential = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ turn
     line, back = here @ essential.T, there @ essential
     slope = (line[:, :2] ** 2).sum(1) / other_focal**2 + (back[:, :2] ** 2).sum(1) / focal**2
-    return (there * line).sum(1) ** 2 <= MOST_ERROR**2 * slope
+    return (there * line).sum(1) ** 2 <= MAX_ERROR**2 * slope

@@ -11,12 +11,12 @@ from ctm_plugin.color.settings import AutoConfig
 from ctm_plugin.color.spaces import log
 from ctm_plugin.color.srgb import Colors, srgb_slope
 
-STRAIGHT = 1e-9
-"""A bend that float32 does not see."""
-BENT = 2.0
-"""So many times steeper is sRGB at black than at 1/100 of white."""
-AROUND = 0.1
-"""Random backgrounds lie round black by this part of the range that the scene fills."""
+MIN_BEND = 1e-9
+"""Bend that float32 cannot tell from a straight line."""
+SRGB_BEND = 2.0
+"""Ratio of sRGB's slope at black to its slope at 1/100 of white."""
+BLACK_MARGIN = 0.1
+"""Range of the random backgrounds round black, as a share of the range that the scene fills."""
 
 
 class Auto(log.Space):
@@ -56,11 +56,11 @@ class Auto(log.Space):
         self._place()
 
     def bend_for(self, median: Number, middle: float, bounds: tuple[float, float]) -> float:
-        mild, furthest = STRAIGHT, bounds[1]
+        mild, furthest = MIN_BEND, bounds[1]
         if self.level < self.brightest:
-            most = self.steepest + toe(float(self.level)) - 1
-            mild = super().bend_for(median, middle, (STRAIGHT, max(most, STRAIGHT)))
-        return max(mild, super().bend_for(median, min(self.config.lowest, middle), (STRAIGHT, furthest)))
+            limit = self.steepest + toe(float(self.level)) - 1
+            mild = super().bend_for(median, middle, (MIN_BEND, max(limit, MIN_BEND)))
+        return max(mild, super().bend_for(median, min(self.config.lowest, middle), (MIN_BEND, furthest)))
 
     def encode(self, rgb: Colors) -> Colors:
         # The base's, with half its operators: the small ones are what a step on a GPU waits for.
@@ -74,7 +74,7 @@ class Auto(log.Space):
         """
         top = self.level.clamp_min(self.config.fills)
         black = self.config.black * top
-        near = torch.minimum(black, top * AROUND)
+        near = torch.minimum(black, top * BLACK_MARGIN)
         behind = (black - near, black + near) if self.config.black else (black, black + top)
         self.places.copy_(torch.stack([black, top, black + top, *behind]))
         if self.level >= self.brightest:
@@ -97,4 +97,4 @@ def toe(level: float) -> float:
 
     s is :func:`~ctm_plugin.color.srgb.srgb_slope`: the darker a scene is, the more its colours are light itself.
     """
-    return 4 * max(0.0, BENT * srgb_slope(level) / srgb_slope(0.0) - 1)
+    return 4 * max(0.0, SRGB_BEND * srgb_slope(level) / srgb_slope(0.0) - 1)

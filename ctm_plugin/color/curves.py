@@ -22,10 +22,10 @@ from ctm_plugin.errors import CTMError
 Values = Float[Tensor, "*shape"]
 Number = Float[Tensor, ""]
 
-LEVEL = 0.999
-"""Of the colours' largest channels this part is below the level."""
-DARKEST = 1e-3
-"""No level is below it: a quarter of an 8-bit step."""
+TOP_QUANTILE = 0.999
+"""Share of the colours' largest channels below the level that is encoded as ``top``."""
+MIN_LEVEL = 1e-3
+"""Least such level: a quarter of an 8-bit step."""
 
 
 def nonblack(rgb: Float[Tensor, "n 3"], label: str) -> Float[Tensor, "m 3"]:
@@ -67,7 +67,7 @@ class Ranged(ColorTransform):
 
     brightest = 0.9
     top: float | Number = 0.9
-    """What the level is encoded as, above black."""
+    """Latent that the level is encoded as, above black's."""
     black: float | Number = 0.0
 
     def __init__(self, config=None):
@@ -75,8 +75,8 @@ class Ranged(ColorTransform):
         self.register_buffer("level", torch.tensor(self.brightest))
 
     def begin(self, rgb: Float[Tensor, "n 3"]) -> None:
-        level = torch.quantile(nonblack(rgb, self.label).amax(-1), LEVEL)
-        self.level.fill_(float(level.clamp(DARKEST, self.brightest)))
+        level = torch.quantile(nonblack(rgb, self.label).amax(-1), TOP_QUANTILE)
+        self.level.fill_(float(level.clamp(MIN_LEVEL, self.brightest)))
 
     def describe(self) -> str:
         return f"gain {float(self.top / self.level):.3g}"
@@ -106,7 +106,7 @@ class Bent(Ranged):
 
     bounds: tuple[float, float]
     middle = 0.5
-    """Where the median comes to, in (0, 1)."""
+    """Latent that the median is encoded as, in (0, 1)."""
 
     def __init__(self, config=None):
         super().__init__(config)

@@ -11,7 +11,7 @@ from ctm_plugin.door import looped
 
 WINDOW, SIGMA = 11, 1.5
 C1, C2 = 0.01**2, 0.03**2
-"""Wang et al. 2004's constants for colours that fill [0, 1]."""
+"""Constants (0.01 L)² and (0.03 L)² of SSIM (Wang et al. 2004), for colours whose range L is 1."""
 
 
 @looped("dssim:dssim")

@@ -12,6 +12,7 @@ from ctm_plugin.color.transform import ColorTransform
 
 # Chroma, value and lightness below this count as 0: bounds the gradients of their quotients by 1e6.
 EPSILON = 1e-6
+"""Least chroma and least value that a hue or a saturation is divided by."""
 
 
 def hue_of(rgb: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Bool, Float, Float64, Int64, UInt8
 from torch import Tensor
 
-from ctm_plugin.color.settings import MOST_STOPS, LightConfig, stops_of
+from ctm_plugin.color.settings import MAX_STOPS, LightConfig, stops_of
 from ctm_plugin.color.srgb import linear_to_srgb, srgb_to_linear
 from ctm_plugin.errors import ConfigError
 
@@ -27,31 +27,39 @@ class Aim(NamedTuple):
     within: float
 
 
-MEAN, TOP, DEVIATION, BEND = Aim(0.45, 0.05), Aim(0.8, 0.025), Aim(0.2, 0.05), Aim(0.0, 0.2)
-"""Of a lit scene's sRGB values: their mean, the mean of their brightest tenth, their standard deviation; and the
-logarithm of the contrast. As well-exposed photographs have them, and how widely."""
-COLOURFUL, MOST_COLOUR = 0.45, 1.25
-"""The mean saturation that colours are brought up to, and by how much at most: noise is coloured as well."""
+TARGET_MEAN, TARGET_TOP, TARGET_DEVIATION, TARGET_CONTRAST = (
+    Aim(0.45, 0.05),
+    Aim(0.8, 0.025),
+    Aim(0.2, 0.05),
+    Aim(0.0, 0.2),
+)
+"""Targets of a lit scene's sRGB, as in well-exposed photographs: mean, mean of the brightest tenth, standard deviation;
+and the logarithm of the contrast."""
+TARGET_SATURATION, MAX_SATURATION = 0.45, 1.25
+"""Mean saturation that colours are brought up to, and the largest factor for it: noise is coloured as well."""
 ROOM_STOPS, ROOM_SPREADS = 3.0, 2.5
-"""How far above the median windows and lamps begin: in stops, and in times the darkest sixth's distance from it."""
-SEEN = 0.05
-"""Of the mean: darker squares do not tell saturation."""
-STEPS, CONTRASTS = torch.arange(0, MOST_STOPS + 0.01, 0.04).double(), 1 + 0.02 * torch.arange(33).double()
-"""Stops and contrasts that are tried."""
-SHARES = 512
-"""Of the values, as many in each, that stand for all."""
-SQUARES = 94
-"""Averaged against noise, along a picture's shorter side."""
-LEVELS = 65536
-"""Of averaged colours that are counted."""
+"""Distance above the median, in stops and in multiples of the darkest sixth's distance below it, where windows and
+lamps begin."""
+MIN_BRIGHTNESS = 0.05
+"""Least brightness of a square whose saturation counts, as a share of the mean."""
+STOPS, CONTRASTS = torch.arange(0, MAX_STOPS + 0.01, 0.04).double(), 1 + 0.02 * torch.arange(33).double()
+"""Stops and contrasts that the search tries."""
+QUANTILES = 512
+"""Number of quantiles that stand for all values."""
+SQUARES_ACROSS = 94
+"""Number of averaging squares along a picture's shorter side; they average noise out."""
+HISTOGRAM_BINS = 65536
+"""Number of bins in the histogram of averaged colours."""
 LUMINANCE = (0.2126, 0.7152, 0.0722)
-"""Of linear sRGB's primaries (IEC 61966-2-1)."""
+"""Weights of red, green and blue in the luminance of linear sRGB (IEC 61966-2-1)."""
 KNEE = 0.5
-"""Linear light above which the shoulder bends: the last stop below white."""
-LEAST = 2.0**0.5
-"""Pictures that need less than half a stop are not brightened: they were lit."""
-WHITE_PERCENTILE = 0.99
-HALVINGS = 60
+"""Linear light above which the shoulder bends: one stop below white."""
+MIN_GAIN = 2.0**0.5
+"""Least gain that is applied, half a stop: pictures that need less were lit."""
+WHITE_QUANTILE = 0.99
+"""Share of the values below white."""
+BISECTIONS = 60
+"""Number of steps of a bisection, down to float64's rounding."""
 
 
 @dataclass(frozen=True)
@@ -90,6 +98,7 @@ class Light:
 
 
 AS_IS = Light()
+"""The light that leaves pictures as they are."""
 
 
 def chosen_light(settings: LightConfig, auto: Light) -> Light:
@@ -185,7 +194,7 @@ def enhancement_gain(
     # sRGB is monotonic, so the percentile may be taken first. torch.quantile refuses more than 2^24 numbers, and
     # kthvalue is refused on a GPU under deterministic algorithms.
     values = torch.cat([target.flatten().cpu() for target in targets])
-    white = values.kthvalue(math.ceil(WHITE_PERCENTILE * len(values))).values
+    white = values.kthvalue(math.ceil(WHITE_QUANTILE * len(values))).values
     linear = float(srgb_to_linear(white.double()))
     return 1.0 / linear if linear > 0.0 else 1.0
 
@@ -213,25 +222,25 @@ def find_light(
     kept = room(light, counts)
     light, counts = light[kept], counts[kept]
     bright = light.amax(1)
-    seen = bright > SEEN * float((bright * counts).sum() / counts.sum().clamp(min=1))
+    seen = bright > MIN_BRIGHTNESS * float((bright * counts).sum() / counts.sum().clamp(min=1))
     if not seen.any():
         return AS_IS
     distance = (1 - light[seen].amin(1) / bright[seen]).double() @ counts[seen] / counts[seen].sum()
-    saturation = round(min(max(COLOURFUL / max(float(distance), 1e-3), 1.0), MOST_COLOUR), 2)
+    saturation = round(min(max(TARGET_SATURATION / max(float(distance), 1e-3), 1.0), MAX_SATURATION), 2)
     values = shares(saturated(light, saturation), counts)
-    gains = 2.0**STEPS
+    gains = 2.0**STOPS
     shown = torch.stack([linear_to_srgb(shoulder(values * gain, gain).clamp(0, 1)) for gain in gains.tolist()])
     logits = shown.clamp(1e-12, 1 - 1e-12).logit()  # contrast multiplies these
     best, gain, contrast = math.inf, 1.0, 1.0
     for power in CONTRASTS.tolist():
         lit = (power * logits).sigmoid()
-        top = lit[:, -(SHARES // 10) :].mean(1)
-        numbers = ((lit.mean(1), MEAN), (top, TOP), (lit.std(1, correction=0), DEVIATION))
+        top = lit[:, -(QUANTILES // 10) :].mean(1)
+        numbers = ((lit.mean(1), TARGET_MEAN), (top, TARGET_TOP), (lit.std(1, correction=0), TARGET_DEVIATION))
         cost = sum(((number - aim.at) / aim.within) ** 2 for number, aim in numbers)
-        cost += ((math.log(power) - BEND.at) / BEND.within) ** 2
+        cost += ((math.log(power) - TARGET_CONTRAST.at) / TARGET_CONTRAST.within) ** 2
         if (least := float(cost.min())) < best:
             best, gain, contrast = least, float(gains[cost.argmin()]), round(power, 2)
-    return Light(gain, contrast, saturation) if gain >= LEAST else AS_IS
+    return Light(gain, contrast, saturation) if gain >= MIN_GAIN else AS_IS
 
 
 def room(light: Float[Tensor, "s 3"], counts: Float64[Tensor, " s"]) -> Bool[Tensor, " s"]:
@@ -263,9 +272,9 @@ def squares(
         Those that hold such pixels, and how many. Rows and columns that fill no square are left out.
     """
     table = srgb_to_linear(torch.arange(256) / 255)
-    many = colors.ndim == 4
-    pictures, masks = (colors, mask) if many else (colors.reshape(1, 1, -1, colors.shape[-1]), mask)
-    side = max(1, round(min(pictures.shape[1:3]) / SQUARES)) if many else 1
+    batched = colors.ndim == 4
+    pictures, masks = (colors, mask) if batched else (colors.reshape(1, 1, -1, colors.shape[-1]), mask)
+    side = max(1, round(min(pictures.shape[1:3]) / SQUARES_ACROSS)) if batched else 1
     means, counts = [], []
     for index, picture in enumerate(pictures):
         code = picture[..., :3].detach().cpu()
@@ -273,7 +282,7 @@ def squares(
             light = table.index_select(0, code.flatten().int()).view(code.shape)
         else:
             light = srgb_to_linear(code.float())
-        counted = None if masks is None else (masks[index] if many else masks.reshape(1, -1)).cpu()
+        counted = None if masks is None else (masks[index] if batched else masks.reshape(1, -1)).cpu()
         if picture.shape[-1] == 4:
             there = picture[..., 3].detach().cpu() > 0
             counted = there if counted is None else there & counted
@@ -297,15 +306,17 @@ def tiled(values: Float[Tensor, "h w c"], side: int) -> Float[Tensor, "rows colu
 
 
 def shares(light: Float[Tensor, "s 3"], counts: Float64[Tensor, " s"]) -> Float64[Tensor, " shares"]:
-    """The middles of :data:`SHARES` equal shares of the values of linear light, which count as often as said."""
-    codes = (linear_to_srgb(light.clamp(0, 1)) * (LEVELS - 1)).round().int()
-    below = torch.bincount(codes.flatten(), counts[:, None].expand_as(codes).flatten(), minlength=LEVELS).cumsum(0)
-    middles = (torch.arange(SHARES).double() + 0.5) / SHARES * below[-1]
-    return srgb_to_linear(torch.searchsorted(below, middles).double() / (LEVELS - 1))
+    """:data:`QUANTILES` quantiles, each the middle of an equal share, of linear light weighted by ``counts``."""
+    codes = (linear_to_srgb(light.clamp(0, 1)) * (HISTOGRAM_BINS - 1)).round().int()
+    below = torch.bincount(
+        codes.flatten(), counts[:, None].expand_as(codes).flatten(), minlength=HISTOGRAM_BINS
+    ).cumsum(0)
+    middles = (torch.arange(QUANTILES).double() + 0.5) / QUANTILES * below[-1]
+    return srgb_to_linear(torch.searchsorted(below, middles).double() / (HISTOGRAM_BINS - 1))
 
 
 def factor_to_mean(levels: Float[Tensor, " n"], counts: Float[Tensor, " n"] | Int64[Tensor, " n"]) -> float:
-    """The factor by which brightened colours have the mean of :data:`MEAN`, by bisection: it rises with the factor.
+    """The factor that brightens colours to the mean of :data:`TARGET_MEAN`, by bisection: the mean rises with it.
 
     Args:
         levels, counts: sRGB values in [0, 1] and how often each occurs.
@@ -315,11 +326,11 @@ def factor_to_mean(levels: Float[Tensor, " n"], counts: Float[Tensor, " n"] | In
     """
     seen = counts > 0  # few of the levels of floats
     levels, shares = levels[seen].double(), counts[seen].double() / counts.sum().clamp(min=1)
-    if not 0.0 < float((levels * shares).sum()) < MEAN.at:
+    if not 0.0 < float((levels * shares).sum()) < TARGET_MEAN.at:
         return 1.0
-    low, high = 0.0, float(MOST_STOPS)
-    for _ in range(HALVINGS):
+    low, high = 0.0, float(MAX_STOPS)
+    for _ in range(BISECTIONS):
         middle = (low + high) / 2
-        too_dark = float((brighten(levels, 2.0**middle) * shares).sum()) < MEAN.at
+        too_dark = float((brighten(levels, 2.0**middle) * shares).sum()) < TARGET_MEAN.at
         low, high = (middle, high) if too_dark else (low, middle)
     return 2.0**high

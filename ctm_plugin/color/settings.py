@@ -8,14 +8,14 @@ from dataclasses import dataclass
 from ctm_plugin.errors import ConfigError
 from ctm_plugin.settings.setting import Settings, setting
 
-KINDS = ("mse", "l1")
+LOSS_KINDS = ("mse", "l1")
 """Distances between colours: squared and absolute differences."""
-MOST_STOPS = 10
-"""The lowest level of 8 bits that is not black is then a middle grey."""
+MAX_STOPS = 10
+"""Largest number of stops of light: it makes the darkest level of 8 bits above black a middle grey."""
 
 
 CONTRASTS, SATURATIONS = (0.5, 2.0), (0.0, 2.0)
-"""Least and most contrast and saturation of lit pictures."""
+"""Least and largest contrast, and saturation, of lit pictures."""
 
 
 def stops_of(light: str | float | None) -> float | None:
@@ -30,8 +30,8 @@ def stops_of(light: str | float | None) -> float | None:
         stops = float(light)
     except ValueError:
         stops = math.nan
-    if not abs(stops) <= MOST_STOPS:
-        raise ConfigError("light", light, f"auto, off, or a number of stops, -{MOST_STOPS} to {MOST_STOPS}")
+    if not abs(stops) <= MAX_STOPS:
+        raise ConfigError("light", light, f"auto, off, or a number of stops, -{MAX_STOPS} to {MAX_STOPS}")
     return stops
 
 
@@ -63,6 +63,7 @@ class LightConfig(Settings):
 
 
 AUTO_LIGHT = LightConfig()
+"""The light that is found from the training pictures."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,7 +74,7 @@ class LossConfig(Settings, section="loss"):
         "mse",
         "mse: squared differences; l1: absolute differences",
         composed="${oc.select:backbone.photometric,${oc.select:ctm.photometric,mse}}",
-        choices=KINDS,
+        choices=LOSS_KINDS,
     )
     weight: float = setting(1.0, "factor on every photometric term", least=0)
 
@@ -191,11 +192,11 @@ class AutoConfig(Settings, section="ctm"):
         0.7, "latent of black in dark scenes, as a share of fills or of the larger range that is used", least=0, most=1
     )
     photometric: str = setting(
-        "mse", "distance between colours where loss=auto: mse (squared) or l1 (absolute)", choices=KINDS
+        "mse", "distance between colours where loss=auto: mse (squared) or l1 (absolute)", choices=LOSS_KINDS
     )
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        most = 1 / max(self.fills, 0.5) - 1  # black and the range above it end at 1
-        if self.black > most:
-            raise self.fault("black", f"a number in [0, {most:.3g}], with ctm.fills={self.fills}")
+        limit = 1 / max(self.fills, 0.5) - 1  # black and the range above it end at 1
+        if self.black > limit:
+            raise self.fault("black", f"a number in [0, {limit:.3g}], with ctm.fills={self.fills}")

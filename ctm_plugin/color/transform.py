@@ -25,7 +25,7 @@ Uniform = Callable[[int, int], Tensor]
 """``uniform(rows, channels)``: a ``[rows, channels]`` float32 tensor of draws from U[0, 1]."""
 
 Ends = tuple[float | Tensor, float | Tensor]
-"""The lowest and the highest of latents, ``[]``."""
+"""Lowest and highest latent of a range, ``[]`` each."""
 
 
 class ColorLoss(NamedTuple):
@@ -119,7 +119,7 @@ class Chain(ColorTransform):
         super().__init__()
         self.outer = outer
         self.inner = inner
-        self.channels, self.label = inner.channels, inner.label
+        self.channels, self.label, self.learning = inner.channels, inner.label, inner.learning
 
     def begin(self, rgb: Tensor) -> None:
         self.inner.begin(fitted(self.outer, rgb))
@@ -158,8 +158,8 @@ def fitted(transform: ColorTransform, rgb: Float[Tensor, "n 3"]) -> Float[Tensor
 
 
 def _check(transform: ColorTransform, done: str, values: Tensor, shape: tuple[int, int]) -> None:
-    told = f"{transform.label}: found the scene's colours {done}"
+    fault = f"{transform.label}: found the scene's colours {done}"
     if values.shape != shape:
-        raise CTMError(f"{told} as {list(values.shape)}, expected {list(shape)} for its {transform.channels} channels")
+        raise CTMError(f"{fault} as {list(values.shape)}, expected {list(shape)} for its {transform.channels} channels")
     if not values.isfinite().all():
-        raise CTMError(f"{told} with NaN or infinity, expected numbers in [0, 1]")
+        raise CTMError(f"{fault} with NaN or infinity, expected numbers in [0, 1]")

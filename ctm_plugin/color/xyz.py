@@ -9,10 +9,12 @@ from torch import Tensor
 from ctm_plugin.color.srgb import channels_of, linear_to_srgb, srgb_to_linear
 
 RGB_TO_XYZ = ((0.412453, 0.357580, 0.180423), (0.212671, 0.715160, 0.072169), (0.019334, 0.119193, 0.950227))
+"""Matrix from linear sRGB to CIE XYZ (D65), and its inverse."""
 XYZ_TO_RGB = tuple(map(tuple, np.linalg.inv(RGB_TO_XYZ).tolist()))
-WHITE = (0.95047, 1.0, 1.08883)
+D65_WHITE = (0.95047, 1.0, 1.08883)
+"""XYZ of D65, the white point of sRGB."""
 CUBE_FROM = 0.008856
-"""Below it CIE's cube roots are lines."""
+"""Y / Yn below which CIE has a line in place of the cube root."""
 
 
 def to_xyz(rgb: Tensor) -> list[Tensor]:
@@ -32,5 +34,5 @@ def _product(matrix: tuple[tuple[float, ...], ...], vector: list[Tensor]) -> lis
 
 
 def cube_root(t: Tensor) -> Tensor:
-    """Of ``[...]`` > CUBE_FROM; the clamp keeps the gradient of the branch not taken finite."""
+    """Cube root of ``[...]`` > CUBE_FROM; the clamp keeps the gradient of the branch not taken finite."""
     return t.clamp(min=CUBE_FROM) ** (1.0 / 3.0)

@@ -29,6 +29,6 @@ class BlenderConfig(Layout, BlenderSettings):
         The scene's exposure is ``exposure`` times the ``light`` in the ``settings.json`` of our renderer, where there
         is one.
         """
-        root = open_layout(self.root, self.layout, self.links)
+        root = open_layout(self.root, self.layout)
         files = [(read_record(inside(root, name)), name == TEST) for name in (TRAIN, TEST)]
         return capture_of(root, files, synthetic=all(angle_alone(root / name) for name in (TRAIN, TEST)))

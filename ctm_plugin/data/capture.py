@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float64
 
-from ctm_plugin.data.points import Found
+from ctm_plugin.data.points import PointsOrReason
 from ctm_plugin.data.readers.folders import view_names
-from ctm_plugin.data.readers.images import Picture
-from ctm_plugin.data.readers.lens import Camera
+from ctm_plugin.data.readers.images import PictureFile
+from ctm_plugin.data.readers.lens import Intrinsics
 from ctm_plugin.data.readers.records import Record
 
 
@@ -35,11 +35,11 @@ class Photograph:
     path: Path
     name: str
     c2w: Float64[np.ndarray, "3 4"]
-    camera: Camera
-    picture: Picture | None
+    camera: Intrinsics
+    picture: PictureFile | None
     mask: Path | None = None
     depth: Path | None = None
-    lit: Picture | None = None
+    lit: PictureFile | None = None
     shown: bool = False
 
 
@@ -59,8 +59,8 @@ class Capture:
         clouds: find points, the best first.
         lacking: the file whose points tell near and far, and what it lacks where they do not; ``None``: ``source``
             should tell both, and a warning says whose points do.
-        synthetic: whether they are Synthetic-NeRF's kind: a thing with nothing behind it, near and far those of all its
-            scenes where they suit the cameras, views named within their split.
+        synthetic: whether they are Synthetic-NeRF's kind, whose files leave out what the paper's codes know: a thing
+            with nothing behind it, near and far of all its scenes where they suit, views named within their split.
     """
 
     root: Path
@@ -71,7 +71,7 @@ class Capture:
     depth_scale: float = 1.0
     records: Sequence[Record] = ()
     rows: Float64[np.ndarray, "n 2"] | None = None
-    clouds: Sequence[Callable[[], Found]] = ()
+    clouds: Sequence[Callable[[], PointsOrReason]] = ()
     lacking: tuple[Path, str] | None = None
     synthetic: bool = False
 

@@ -9,20 +9,20 @@ import numpy as np
 from jaxtyping import Float, Float32
 from skimage.registration import optical_flow_ilk
 
-FEWEST, MOST = 40, 120
-"""Frames that are chosen in all, where there are as many."""
-APART = 1 / 16
+MIN_FRAMES, MAX_FRAMES = 40, 120
+"""Least and largest number of frames chosen from all clips together, where there are as many."""
+FRAME_MOVEMENT = 1 / 16
 """Movement from one chosen frame to the next, in longer sides of the picture."""
-STILL = 0.1
-"""A clip that moves less shows one place."""
-LONG = 80
-"""Longer side of the pictures whose movement is measured: noise is gone there, and light is left."""
-STEP = 0.02
-"""Movement after which it is measured from another frame, in longer sides: a hand that shakes goes nowhere."""
-BLURRED = 0.5
-"""Of the sharpness of the frames that are chosen before or after it, less than which one is left out."""
-SKIPPED = 4
-"""Frames, at most, from one measurement of movement to the next."""
+MIN_MOVEMENT = 0.1
+"""Least movement, in longer sides, of a clip that shows more than one place."""
+FLOW_SIDE = 80
+"""Longer side in pixels of the frames whose movement is measured: averaging removes their noise."""
+BASE_MOVEMENT = 0.02
+"""Movement, in longer sides, after which it is measured from a new frame: a hand that shakes adds up to nothing."""
+MIN_SHARPNESS = 0.5
+"""Least sharpness of a chosen frame, as a share of its sharper neighbour's; less sharp ones are left out."""
+MAX_STRIDE = 4
+"""Most frames from one measurement of movement to the next."""
 
 
 class Course(NamedTuple):
@@ -40,7 +40,7 @@ class Course(NamedTuple):
 def course(frames: Iterable[Float32[np.ndarray, "h w"]]) -> Course:
     """Watch grey frames ``[H, W]``, of which three are held at a time.
 
-    Movement is the median length of the optical flow from a frame before, which is replaced once that is ``STEP``.
+    Movement is the median length of the optical flow from a base frame, a new one after each ``BASE_MOVEMENT``.
     """
     sharpness, measured, moved = [], [0], [0.0]
     first, base, stride = None, 0.0, 1
@@ -52,11 +52,11 @@ def course(frames: Iterable[Float32[np.ndarray, "h w"]]) -> Course:
             small = _small(frame)
             flow = optical_flow_ilk(first, small, radius=5, num_warp=3)
             far = float(np.median(np.hypot(*flow))) / max(small.shape)
-            fast = base + far - moved[-1] > STEP / 2
-            stride = max(stride // 2, 1) if fast else min(stride + 1, SKIPPED)
+            fast = base + far - moved[-1] > BASE_MOVEMENT / 2
+            stride = max(stride // 2, 1) if fast else min(stride + 1, MAX_STRIDE)
             measured.append(number)
             moved.append(max(base + far, moved[-1]))
-            if far > STEP:
+            if far > BASE_MOVEMENT:
                 first, base = small, moved[-1]
     numbers = np.arange(len(sharpness))
     return Course(np.interp(numbers, measured, moved) if sharpness else np.zeros(0), np.array(sharpness))
@@ -65,10 +65,10 @@ def course(frames: Iterable[Float32[np.ndarray, "h w"]]) -> Course:
 def choose(courses: Sequence[Course]) -> list[list[int]]:
     """Choose frames of clips: numbers from 0 for each clip, none of one that shows one place.
 
-    All windows are as long as one another in movement, ``FEWEST`` to ``MOST`` of all clips together.
+    All windows are as long as one another in movement, ``MIN_FRAMES`` to ``MAX_FRAMES`` of all clips together.
     """
-    lengths = [each.moved[-1] if len(each.moved) and each.moved[-1] >= STILL else 0.0 for each in courses]
-    count = np.clip(round(sum(lengths) / APART), FEWEST, MOST)
+    lengths = [each.moved[-1] if len(each.moved) and each.moved[-1] >= MIN_MOVEMENT else 0.0 for each in courses]
+    count = np.clip(round(sum(lengths) / FRAME_MOVEMENT), MIN_FRAMES, MAX_FRAMES)
     return [
         _sharpest(each, max(round(count * length / sum(lengths)), 1)) if length else []
         for each, length in zip(courses, lengths, strict=True)
@@ -82,7 +82,7 @@ def _sharpest(course: Course, count: int) -> list[int]:
     parts = np.split(course.sharpness, starts[1:])
     best = np.array([start + part.argmax() for start, part in zip(starts, parts, strict=True)])
     near = np.pad(course.sharpness[best], 1)
-    return best[near[1:-1] >= BLURRED * np.maximum(near[:-2], near[2:])].tolist()
+    return best[near[1:-1] >= MIN_SHARPNESS * np.maximum(near[:-2], near[2:])].tolist()
 
 
 def _sharpness(frame: Float32[np.ndarray, "h w"]) -> float:
@@ -90,8 +90,8 @@ def _sharpness(frame: Float32[np.ndarray, "h w"]) -> float:
 
 
 def _small(frame: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "i j"]:
-    """A frame averaged to ``LONG``, with a deviation of 1, so that the dark moves as the light does."""
-    factor = max(max(frame.shape) // LONG, 1)
+    """A frame averaged to ``FLOW_SIDE``, with a deviation of 1, so that the dark moves as the light does."""
+    factor = max(max(frame.shape) // FLOW_SIDE, 1)
     height, width = (side // factor for side in frame.shape)
     small = frame[: height * factor, : width * factor].reshape(height, factor, width, factor).mean((1, 3))
     return (small - small.mean()) / max(small.std(), 1e-6)

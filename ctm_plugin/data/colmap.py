@@ -11,11 +11,11 @@ from pathlib import Path
 from ctm_plugin.data.capture import Capture, Photograph
 from ctm_plugin.data.load import Layout
 from ctm_plugin.data.photographs import every, existing, find_listed, find_pictures, masks_beside
-from ctm_plugin.data.points import Found, read_cloud
+from ctm_plugin.data.points import PointsOrReason, read_cloud
 from ctm_plugin.data.readers.colmap_model import is_as_shown, model_file, read_cameras, read_images, usable
 from ctm_plugin.data.readers.folders import inside, is_picture
 from ctm_plugin.data.readers.images import read_picture
-from ctm_plugin.data.readers.layouts import MODELS, model_folders, open_layout
+from ctm_plugin.data.readers.layouts import MODEL_FOLDERS, model_folders, open_layout
 from ctm_plugin.data.settings import ColmapSettings
 from ctm_plugin.errors import DataError
 
@@ -35,7 +35,7 @@ class ColmapConfig(Layout, ColmapSettings):
 
         Pictures that are registered but missing are left out, with one warning.
         """
-        root = open_layout(self.root, self.layout, self.links)
+        root = open_layout(self.root, self.layout)
         model = find_model(root)
         cameras_file, source, points = (model_file(model, name) for name in ("cameras", "images", "points3D"))
         cameras = read_cameras(cameras_file)
@@ -56,7 +56,7 @@ class ColmapConfig(Layout, ColmapSettings):
         ]
 
         @cache
-        def cloud() -> Found:
+        def cloud() -> PointsOrReason:
             return (read_cloud(points.stem, taken, points), "") if points.exists() else (None, "")
 
         return Capture(
@@ -75,9 +75,9 @@ def find_model(root: Path) -> Path:
     folders = model_folders(root)
     if len(folders) > 1 and folders[0].parent == folders[1].parent:
         others = ", ".join(path.name for path in folders[1:])
-        told = f"the model in {folders[0].name} is used, {others} not: COLMAP could not join them"
-        warnings.warn(f"{folders[0].parent}: {told}", stacklevel=3)
-    return folders[0] if folders else root / MODELS[0]
+        warning = f"the model in {folders[0].name} is used, {others} not: COLMAP could not join them"
+        warnings.warn(f"{folders[0].parent}: {warning}", stacklevel=3)
+    return folders[0] if folders else root / MODEL_FOLDERS[0]
 
 
 def tell_of_others(folder: Path, known: int) -> None:
@@ -85,8 +85,8 @@ def tell_of_others(folder: Path, known: int) -> None:
     for each in (folder, folder.with_name("input")):
         count = sum(map(is_picture, each.rglob("*"))) if each.is_dir() else 0
         if count > known:
-            told = f"the model has the cameras of {known} of {count} pictures; the others are not trained on"
-            warnings.warn(f"{each}: {told}", stacklevel=3)
+            warning = f"the model has the cameras of {known} of {count} pictures; the others are not trained on"
+            warnings.warn(f"{each}: {warning}", stacklevel=3)
             return
 
 
@@ -98,13 +98,13 @@ def picture_folder(root: Path, config: ColmapConfig, names: Sequence[str]) -> tu
             raise DataError(folder, "no such folder", "the folder of the pictures (dataset.images)")
         return folder, False
     if names and not any(path.is_dir() for path in root.glob("images*")):
-        found = sorted(path.name for path in root.iterdir() if path.is_dir() and find_listed(path, names[0], root))
-        if len(found) > 1:
+        folders = sorted(path.name for path in root.iterdir() if path.is_dir() and find_listed(path, names[0], root))
+        if len(folders) > 1:
             raise DataError(
                 root,
-                f"pictures in {', '.join(found)}",
-                " or ".join(f"dataset.images={shlex.quote(name)}" for name in found),
+                f"pictures in {', '.join(folders)}",
+                " or ".join(f"dataset.images={shlex.quote(name)}" for name in folders),
             )
-        if found or find_listed(root, names[0], root):
-            return root / found[0] if found else root, False
+        if folders or find_listed(root, names[0], root):
+            return root / folders[0] if folders else root, False
     return find_pictures(root, config.whole_factor)

@@ -15,17 +15,17 @@ from torch import Tensor
 
 from ctm_plugin.color.light import brighten
 from ctm_plugin.data.degrade import add_noise, view_generator
-from ctm_plugin.data.readers.images import Picture, read_depth, read_image, to_8_bits
+from ctm_plugin.data.readers.images import PictureFile, read_depth, read_image, to_8_bits
 from ctm_plugin.data.readers.picture import MAX_PIXELS
 from ctm_plugin.data.settings import PhotoConfig
 from ctm_plugin.errors import DataError
 from ctm_plugin.scene.shrink import shrink, shrink_depth, shrink_mask
 from ctm_plugin.scene.views import DARK_LEVEL, Pixels
 
-DYNAMIC = "dynamic_mask_"
-"""instant-ngp's prefix of a picture's name for the mask next to it, whose pixels that are not black are ignored."""
-FEW = 8
-"""Pictures of which is found out whether all are dark."""
+DYNAMIC_PREFIX = "dynamic_mask_"
+"""instant-ngp's prefix of a mask's file name; its pixels that are not black are ignored."""
+SAMPLE_PICTURES = 8
+"""Pictures from which it is decided whether all are dark."""
 
 
 def memory() -> int:
@@ -33,7 +33,7 @@ def memory() -> int:
     return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
 
 
-def means_matter(pictures: Sequence[Picture | None], config: PhotoConfig) -> bool:
+def means_matter(pictures: Sequence[PictureFile | None], config: PhotoConfig) -> bool:
     """Whether pictures become smaller and are dark: a mean over many pixels tells more of their few levels than one of
     256 does.
 
@@ -44,14 +44,14 @@ def means_matter(pictures: Sequence[Picture | None], config: PhotoConfig) -> boo
         return False
     if all(config.shrunk(*picture.header[:2]) == picture.header[:2] for picture in there):
         return False
-    few = there[:: -(-len(there) // FEW)]
+    few = there[:: -(-len(there) // SAMPLE_PICTURES)]
     colours = [shrink(each.image()[..., :3].clamp(0, 1), *config.shrunk(*each.header[:2])).flatten() for each in few]
     return float(np.quantile(torch.cat(colours).numpy(), 0.99)) < DARK_LEVEL
 
 
 def develop(
-    pictures: Sequence[Picture | None], names: Sequence[str], config: PhotoConfig, noisy: bool, canvas: tuple[int, int],
-    deep: bool = False,
+    pictures: Sequence[PictureFile | None], names: Sequence[str], config: PhotoConfig, noisy: bool,
+    canvas: tuple[int, int], deep: bool = False,
 ) -> Pixels:  # fmt: skip
     """The images ``[N, H, W, C]`` of one split: read, clipped to [0, 1], shrunk, dimmed, given noise and rounded.
 
@@ -75,8 +75,8 @@ def develop(
         expected = f"less than the {memory() / 2**30:.0f} GiB of this machine: see dataset.downscale, dataset.skip"
         raise DataError(folder, found, expected)
     for colours in sorted({header.colours for header in headers if header.colours}):
-        told = f"pictures have {colours}, which is not applied: turn them into sRGB"
-        warnings.warn(f"{folder}: {told}", stacklevel=2)
+        note = f"pictures have {colours}, which is not applied: turn them into sRGB"
+        warnings.warn(f"{folder}: {note}", stacklevel=2)
     images = torch.zeros(len(pictures), height, width, channels, dtype=dtype)
     clipped = []
 
@@ -102,8 +102,8 @@ def develop(
     with ThreadPoolExecutor(at_once) as pool:
         list(pool.map(fill, there))
     if clipped:
-        told = f"{len(clipped)} of {len(there)} pictures have light outside [0, 1], which is clipped"
-        warnings.warn(f"{folder}: {told}, such as {min(clipped)}", stacklevel=2)
+        note = f"{len(clipped)} of {len(there)} pictures have light outside [0, 1], which is clipped"
+        warnings.warn(f"{folder}: {note}, such as {min(clipped)}", stacklevel=2)
     return images
 
 
@@ -122,7 +122,7 @@ def develop_masks(
 ) -> Bool[Tensor, "n h w"] | None:
     """Find which pixels ``[N, *canvas]`` of one split count: those wholly inside a mask's area brighter than half.
 
-    Of instant-ngp's masks, ``DYNAMIC``, the black area counts. Pixels of the canvas outside an image's own size never
+    In instant-ngp's masks (``DYNAMIC_PREFIX``) the black area counts. Pixels of the canvas outside an image never
     count. Where a mask is transparent somewhere, its alpha stands for its brightness. ``None`` where all pixels count.
     """
     if not any(paths) and {*sizes} == {canvas}:
@@ -132,7 +132,7 @@ def develop_masks(
         masks[index, :height, :width] = True
         if path is None:
             continue
-        image, dynamic = read_image(path), path.name.startswith(DYNAMIC)
+        image, dynamic = read_image(path), path.name.startswith(DYNAMIC_PREFIX)
         cut_out = image.shape[-1] == 4 and bool((image[..., 3] < 1).any())
         level = image[..., 3] if cut_out else image[..., :3].amax(-1)
         mask = level == 0 if dynamic else level > 127.5 / 255

@@ -12,6 +12,7 @@ from ctm_plugin.data.settings import EmbeddedSettings, FolderConfig, PhotoConfig
 from ctm_plugin.scene.views import Scene
 
 ASSETS = Path(__file__).parent / "assets"
+"""Folder of the scenes that come with the package."""
 
 
 class Embedded(EmbeddedSettings):

@@ -15,8 +15,8 @@ from ctm_plugin.data.readers.folders import inside
 from ctm_plugin.errors import ConfigError
 from ctm_plugin.scene.views import Views, unit
 
-BRIGHTER = 4.0
-"""Times the mean linear light of the training pictures, above which test pictures were not taken in the same light."""
+MAX_LIGHT_RATIO = 4.0
+"""Largest ratio of mean linear light, test to training pictures, that counts as the same light."""
 
 
 def check_folder(root: Path, key: str, name: str | None) -> None:
@@ -51,7 +51,7 @@ def warn_of_lit(capture: Capture, train: Views, test: Views) -> None:
         for images in (pictures, train.images)
     )
     ratio = tested / max(trained, 1e-9)
-    if ratio <= BRIGHTER:
+    if ratio <= MAX_LIGHT_RATIO:
         return
     keys = ""
     if all(len(home) == 1 for home in homes):

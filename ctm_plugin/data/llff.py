@@ -13,9 +13,9 @@ from ctm_plugin.data.load import Layout
 from ctm_plugin.data.photographs import every, find_pictures, list_pictures, masks_beside
 from ctm_plugin.data.points import model_beside
 from ctm_plugin.data.readers.folders import inside, is_picture
-from ctm_plugin.data.readers.images import Picture, map_numbers, read_picture
-from ctm_plugin.data.readers.layouts import POSES, model_folder, open_layout
-from ctm_plugin.data.readers.lens import Camera
+from ctm_plugin.data.readers.images import PictureFile, map_numbers, read_picture
+from ctm_plugin.data.readers.layouts import LLFF_FILE, model_folder, open_layout
+from ctm_plugin.data.readers.lens import Intrinsics
 from ctm_plugin.data.readers.records import rendered
 from ctm_plugin.data.settings import LLFFSettings
 from ctm_plugin.errors import DataError
@@ -38,17 +38,17 @@ class LLFFConfig(Layout, LLFFSettings):
         file's units and near lies a little in front of the nearest bound. Far is a distance along the rays that holds
         all that the bounds hold.
         """
-        root = open_layout(self.root, self.layout, self.links)
+        root = open_layout(self.root, self.layout)
         return self.posed(root, *self.developed(root))
 
-    def developed(self, root: Path) -> tuple[list[Picture], bool]:
+    def developed(self, root: Path) -> tuple[list[PictureFile], bool]:
         """The pictures, and whether they have been shrunk by ``downscale`` already."""
         folder, shrunk = find_pictures(root, self.whole_factor, self.factor)
         return [read_picture(path) for path in list_pictures(root, folder)], shrunk
 
-    def posed(self, root: Path, pictures: list[Picture], shrunk: bool) -> Capture:
+    def posed(self, root: Path, pictures: list[PictureFile], shrunk: bool) -> Capture:
         """Put pictures and the rows of ``poses_bounds.npy`` together, one for each in the order of their names."""
-        source, paths = inside(root, POSES), [picture.path for picture in pictures]
+        source, paths = inside(root, LLFF_FILE), [picture.path for picture in pictures]
         c2w, hwf, bounds = read_poses(source, bounded=self.near is None or self.far is None)
         if len(paths) != len(c2w):
             expected = f"{len(paths)}, one for each picture in {paths[0].parent}{which(root)}"
@@ -63,7 +63,7 @@ class LLFFConfig(Layout, LLFFSettings):
                 picture.path,
                 named[row],
                 c2w[row],
-                Camera(width, height, focal, focal, 0.5 * width, 0.5 * height, where=f"row {row}"),
+                Intrinsics(width, height, focal, focal, 0.5 * width, 0.5 * height, where=f"row {row}"),
                 picture,
                 masks[row],
                 depths[row],

@@ -24,10 +24,10 @@ from ctm_plugin.scene.kinds import AUTO
 from ctm_plugin.scene.poses import Similarity, mean_pose, meeting_depths
 from ctm_plugin.scene.views import Points, Scene, Views
 
-NEAREST = 0.75
-"""The nearest bound is brought to a distance of 1 / 0.75, so that NDC's near plane, at 1, lies in front of all."""
-FLIPPED = np.array([1.0, -1.0, -1.0, 1.0])
-"""Takes OpenCV's axes, y down and z forward, to OpenGL's."""
+NEAR_TARGET = 0.75
+"""The nearest bound is scaled to a distance of 1 / 0.75, so that NDC's near plane, at 1, lies in front of all."""
+OPENCV_TO_OPENGL = np.array([1.0, -1.0, -1.0, 1.0])
+"""Signs that take OpenCV's axes (y down, z forward) to OpenGL's."""
 
 
 class Layout:
@@ -43,20 +43,17 @@ class Layout:
         """
         raise NotImplementedError
 
-    def rig(self) -> Rig:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # they are told when the pictures are loaded
-            return self._rig(self.capture())
-
-    def _rig(self, capture: Capture) -> Rig:
+    def rig(self, capture: Capture | None = None) -> Rig:
+        """How the cameras stand, without the pictures; the ``capture`` is read unless it is given."""
+        capture = capture or self.capture()
         first = next(each.picture.header for each in capture.photographs if each.picture)
         size = first[:2] if capture.shrunk else self.shrunk(first.height, first.width)
         cameras = {each.camera for each in capture.photographs}
         alone = capture.synthetic or first.alpha
         return rig_of(cameras, list(capture.c2w), size, alone, nearest(capture, self))
 
-    def load(self) -> Scene:
-        """Read the data set.
+    def load(self, capture: Capture | None = None) -> Scene:
+        """Read the data set; its ``capture`` is read unless it is given.
 
         Returns:
             The scene, named as its folder, in units of the files' poses unless ``geometry`` is forward.
@@ -66,8 +63,8 @@ class Layout:
             ConfigError: ``downscale`` or ``width`` do not suit the size, ``random_matched`` lacks alpha, or the cameras
                 do not face forward as ``geometry`` says.
         """
-        capture = self.capture()
-        geometry = self._rig(capture).geometry()[0] if self.geometry == AUTO else self.geometry
+        capture = capture or self.capture()
+        geometry = self.rig(capture).geometry()[0] if self.geometry == AUTO else self.geometry
         config = replace(self, geometry=geometry)
         train, test = develop_photographs(capture, config)
         if not capture.synthetic and test.lit is None and getattr(self, "dark", None) is None:
@@ -86,10 +83,10 @@ def make_scene(
     One warning tells of cameras that all look away from where their axes meet, as with another program's axes.
     """
     c2w = torch.cat([train.c2w, test.c2w]).double().numpy()
-    if config.geometry != "forward" and meeting_depths(c2w * FLIPPED) is not None:
-        told = "the cameras' axes meet behind all cameras: they look outwards, or have OpenCV's axes"
+    if config.geometry != "forward" and meeting_depths(c2w * OPENCV_TO_OPENGL) is not None:
+        reason = "the cameras' axes meet behind all cameras: they look outwards, or have OpenCV's axes"
         warnings.warn(
-            f"{root}: {told}, of which y and z (columns 2 and 3 of camera to world) are to be flipped", stacklevel=3
+            f"{root}: {reason}, of which y and z (columns 2 and 3 of camera to world) are to be flipped", stacklevel=3
         )
     if train.has_alpha and not train.images[..., 3].any():
         warnings.warn(f"{root}: no training picture shows anything, their alpha is 0 everywhere", stacklevel=3)
@@ -122,7 +119,7 @@ def settle(scene: Scene, root: Path) -> Scene:
     views = (scene.train, scene.test)
     if not scene.near > 0:
         raise ConfigError("dataset.near", scene.near, f"more than 0 for dataset.geometry=forward of {root}")
-    scale = 1.0 / (NEAREST * scene.near)
+    scale = 1.0 / (NEAR_TARGET * scene.near)
     given = torch.cat([split.c2w for split in views]).double().numpy()
     mean = mean_pose(given)
     world = Similarity(scale, mean[:, :3].T, -scale * mean[:, :3].T @ mean[:, 3], off=0.0, angle=0.0)

@@ -21,27 +21,27 @@ from ctm_plugin.scene.poses import MAX_COORDINATE, meeting_depths
 from ctm_plugin.scene.views import Views
 from ctm_plugin.settings.setting import Number
 
-ALL = (0.5, 99.5)
-"""Percentiles of all depths that all cameras see: what a few bad points claim is left out."""
-EACH = (5.0, 95.0)
-"""Percentiles of what one camera sees, which the bounds hold too: a close-up among many pictures is not cut."""
-CROWD = 20
-"""Points of a camera of which the percentiles of its own are taken."""
-PICTURES = 3
-"""Pictures that see a point, at least, where there are such points: two rays meet anywhere by mistake."""
-NEAREST, FARTHEST = 0.5, {"bounded": 2.0, "forward": 10.0, "unbounded": 10.0}
-"""Bounds without points, in depths of where the cameras' axes meet, of the nearest camera and of the farthest: only
-between the cameras and a bounded scene's far do voxels cost."""
-CLOSE, WIDE = 0.1, 10.0
+DEPTH_PERCENTILES = (0.5, 99.5)
+"""Percentiles of the depths of all cameras together that are the bounds: a few bad points are left out."""
+CAMERA_PERCENTILES = (5.0, 95.0)
+"""Percentiles of one camera's depths, which the bounds hold too: a close-up among many pictures is not cut."""
+MIN_CAMERA_POINTS = 20
+"""Least number of points of a camera whose own percentiles count."""
+MIN_TRACK = 3
+"""Least number of pictures that observe a point, where there are such points: two rays can meet by mistake."""
+NEAR_DEPTHS, FAR_DEPTHS = 0.5, {"bounded": 2.0, "forward": 10.0, "unbounded": 10.0}
+"""Bounds without points, as multiples of the least and largest depth at which the cameras' axes meet. A bounded scene's
+far is smaller, as its voxels cost."""
+NEAR_SPREADS, FAR_SPREADS = 0.1, 10.0
 """Bounds where axes do not meet, in largest distances between cameras."""
-STRAY = 5.0
-"""How far beyond the median of all fars one is that of bad points."""
-MARGIN = 0.9
-"""Where no near plane is set, rays start at this part of the nearest depth: percentiles leave a few points out."""
+OUTLIER_FAR = 5.0
+"""Ratio of a far to the median of all fars above which it comes from bad points."""
+NEAR_MARGIN = 0.9
+"""Share of the nearest depth at which rays start where no near plane is set: percentiles leave a few points out."""
 NEAR, FAR = 2.0, 6.0
 """Synthetic-NeRF's bounds, for files that do not give their own."""
-RADIUS = 1.0
-"""What these bounds have to hold on both sides of where the cameras' axes meet."""
+OBJECT_RADIUS = 1.0
+"""Radius of the ball round the point where the cameras' axes meet that these bounds must enclose."""
 UNTOLD, SET = "no near and far there", "dataset.near and dataset.far set them"
 
 
@@ -49,8 +49,8 @@ def near_far(capture: Capture, config: BoundsConfig, views: Sequence[Views]) -> 
     """Choose near and far: the configuration's, else the first file's that has them, else those that are found."""
     near, far = (given(capture, config, key) for key in ("near", "far"))
     if near is None or far is None:
-        found = found_bounds(capture, config.geometry, views)
-        near, far = found[0] if near is None else near, found[1] if far is None else far
+        bounds = found_bounds(capture, config.geometry, views)
+        near, far = bounds[0] if near is None else near, bounds[1] if far is None else far
     if near >= far:
         source = (capture.lacking or [capture.source])[0]
         raise DataError(source, f"near {near:g}, far {far:g}", "near < far (dataset.near, dataset.far)")
@@ -74,8 +74,8 @@ def nearest(capture: Capture, config: BoundsConfig) -> float | None:
     for read in capture.clouds:
         with suppress(DataError):
             cloud, _ = read()
-            if cloud is not None and (found := bounds_of(cloud, ())) is not None:
-                return found[0]
+            if cloud is not None and (bounds := bounds_of(cloud, ())) is not None:
+                return bounds[0]
     return None
 
 
@@ -91,11 +91,11 @@ def found_bounds(capture: Capture, geometry: Geometry, views: Sequence[Views]) -
     remarks = ""
     for read in capture.clouds:
         cloud, remark = read()
-        if cloud is not None and (found := bounds_of(cloud, views)) is not None:
-            near, far = ray_bounds(*found, geometry, views[0])
+        if cloud is not None and (bounds := bounds_of(cloud, views)) is not None:
+            near, far = ray_bounds(*bounds, geometry, views[0])
             if capture.lacking is None:
-                told = f"{near:.3g} and {far:.3g} are taken from the points of {cloud.name}{remarks}"
-                warnings.warn(f"{capture.source}: {UNTOLD}; {told}: {SET}", stacklevel=2)
+                warning = f"{near:.3g} and {far:.3g} are taken from the points of {cloud.name}{remarks}"
+                warnings.warn(f"{capture.source}: {UNTOLD}; {warning}: {SET}", stacklevel=2)
             return near, far
         remark = remark if cloud is None else f"{cloud.name} has no points that the pictures see"
         remarks += f" ({remark})" if remark and capture.lacking is None else ""
@@ -107,7 +107,7 @@ def ray_bounds(nearest: float, farthest: float, geometry: Geometry, views: Views
 
     ``forward`` keeps the nearest as it is: :func:`~ctm_plugin.data.load.settle` has its own margin.
     """
-    return nearest * (1.0 if geometry == "forward" else MARGIN), farthest * widest(views)
+    return nearest * (1.0 if geometry == "forward" else NEAR_MARGIN), farthest * widest(views)
 
 
 def depth_bounds(depths: Sequence[Float64[np.ndarray, " _"]]) -> tuple[float, float] | None:
@@ -118,8 +118,8 @@ def depth_bounds(depths: Sequence[Float64[np.ndarray, " _"]]) -> tuple[float, fl
     depths = [each[(each > 0) & (each <= MAX_COORDINATE)] for each in depths]
     if not any(len(each) for each in depths):
         return None
-    rows = [np.percentile(np.concatenate(depths), ALL)]
-    rows += [np.percentile(each, EACH) for each in depths if len(each) >= CROWD]
+    rows = [np.percentile(np.concatenate(depths), DEPTH_PERCENTILES)]
+    rows += [np.percentile(each, CAMERA_PERCENTILES) for each in depths if len(each) >= MIN_CAMERA_POINTS]
     near, far = np.array(rows).T
     return float(near.min()), float(far.max())
 
@@ -127,10 +127,10 @@ def depth_bounds(depths: Sequence[Float64[np.ndarray, " _"]]) -> tuple[float, fl
 def depths_seen(cloud: Cloud) -> list[Float64[np.ndarray, " _"]]:
     """Compute the depths, in units of the data set's poses, for each picture of COLMAP's, of the points that it sees.
 
-    Points that fewer than ``PICTURES`` of the pictures see count only where there are no others.
+    Points that fewer than ``MIN_TRACK`` of the pictures see count only where there are no others.
     """
     seen, times = np.unique(np.concatenate([np.empty(0, np.int64), *cloud.tracks]), return_counts=True)
-    trusted = seen[times >= min(PICTURES, times.max(initial=0))]
+    trusted = seen[times >= min(MIN_TRACK, times.max(initial=0))]
     depths = []
     for picture, track in zip(cloud.taken, cloud.tracks, strict=True):
         points = cloud.positions[np.intersect1d(track, trusted)]
@@ -140,8 +140,8 @@ def depths_seen(cloud: Cloud) -> list[Float64[np.ndarray, " _"]]:
 
 def bounds_of(cloud: Cloud, views: Sequence[Views]) -> tuple[float, float] | None:
     """Find the nearest and farthest depths of the points that pictures see, or that views show where nobody tells."""
-    if (found := depth_bounds(depths_seen(cloud))) is not None:
-        return found
+    if (bounds := depth_bounds(depths_seen(cloud))) is not None:
+        return bounds
     positions = torch.from_numpy(cloud.world.moved(cloud.positions))
     shown = [projected(positions, split, view) for split in views for view in range(len(split))]
     return depth_bounds([each.depth[each.seen].numpy() for each in shown])
@@ -155,33 +155,33 @@ def camera_bounds(c2w: Float64[np.ndarray, "n 3 4"], geometry: Geometry) -> tupl
     times that.
     """
     if (depths := meeting_depths(c2w)) is not None:
-        return NEAREST * float(depths.min()), FARTHEST[geometry] * float(depths.max())
+        return NEAR_DEPTHS * float(depths.min()), FAR_DEPTHS[geometry] * float(depths.max())
     centres = c2w[:, :, 3]
     spread = max(float(np.linalg.norm(centres - each, axis=1).max()) for each in centres)
-    return (CLOSE * spread, WIDE * spread) if spread > 0 else None
+    return (NEAR_SPREADS * spread, FAR_SPREADS * spread) if spread > 0 else None
 
 
 def bounds_of_cameras(
     capture: Capture, geometry: Geometry, source: Path, missing: str, remarks: str = ""
 ) -> tuple[float, float]:
     """Guess near and far from only the cameras, with one warning of what ``source`` lacks and why others are no use."""
-    if (found := camera_bounds(capture.c2w, geometry)) is None:
+    if (bounds := camera_bounds(capture.c2w, geometry)) is None:
         raise DataError(source, f"{missing}, all cameras at one place", "some, or dataset.near and dataset.far")
-    told = "{:.3g} and {:.3g} are taken from where the cameras stand and look".format(*found)
-    warnings.warn(f"{source}: {missing}; {told}{remarks}: {SET}", stacklevel=2)
-    return found
+    warning = "{:.3g} and {:.3g} are taken from where the cameras stand and look".format(*bounds)
+    warnings.warn(f"{source}: {missing}; {warning}{remarks}: {SET}", stacklevel=2)
+    return bounds
 
 
 def usual_bounds(capture: Capture, geometry: Geometry) -> tuple[float, float]:
     """Synthetic-NeRF's near and far where they suit the cameras, else such as do; a warning tells of doubts.
 
-    They suit where a ball of ``RADIUS`` round the point where the axes meet lies between them in all cameras.
+    They suit where a ball of ``OBJECT_RADIUS`` round the point where the axes meet lies between them in all cameras.
     """
     depths = meeting_depths(capture.c2w)
     if depths is None:
-        told = f"near {NEAR:g} and far {FAR:g} are Synthetic-NeRF's, and the cameras do not look at one point"
-        warnings.warn(f"{capture.source}: {told}: {SET}", stacklevel=2)
-    elif depths.min() < NEAR + RADIUS or depths.max() > FAR - RADIUS:
+        warning = f"near {NEAR:g} and far {FAR:g} are Synthetic-NeRF's, and the cameras do not look at one point"
+        warnings.warn(f"{capture.source}: {warning}: {SET}", stacklevel=2)
+    elif depths.min() < NEAR + OBJECT_RADIUS or depths.max() > FAR - OBJECT_RADIUS:
         middle = float(np.median(depths))
         missing = f"near {NEAR:g} and far {FAR:g} do not suit cameras {middle:.3g} away from where they look"
         return bounds_of_cameras(capture, geometry, capture.source, missing)
@@ -191,16 +191,16 @@ def usual_bounds(capture: Capture, geometry: Geometry) -> tuple[float, float]:
 def joint_bounds(capture: Capture, geometry: Geometry) -> tuple[float, float]:
     """Nearest and farthest depth of all rows; one warning tells of rows that are left out.
 
-    Rows of NaN are of pictures that see no points. A far of more than ``STRAY`` medians is that of a few bad points,
-    which would spoil a box; NDC has room for it.
+    Rows of NaN are of pictures that see no points. A far above ``OUTLIER_FAR`` medians comes from a few bad points
+    and would spoil a box; NDC has room for it.
     """
     bounds = capture.rows
     seen = ~np.isnan(bounds[:, 0])
-    stray = seen & (bounds[:, 1] > STRAY * np.median(bounds[seen, 1])) & (geometry != "forward")
+    stray = seen & (bounds[:, 1] > OUTLIER_FAR * np.median(bounds[seen, 1])) & (geometry != "forward")
     if not (seen & ~stray).all():
         rows = ", ".join(map(str, np.flatnonzero(~seen | stray)[:10]))
-        told = f"they have no points, or a far beyond {STRAY:g} times the others'"
-        warnings.warn(f"{capture.source}: the bounds of rows {rows} are left out: {told}: {SET}", stacklevel=2)
+        warning = f"they have no points, or a far beyond {OUTLIER_FAR:g} times the others'"
+        warnings.warn(f"{capture.source}: the bounds of rows {rows} are left out: {warning}: {SET}", stacklevel=2)
     near, far = bounds[seen & ~stray].T
     return float(near.min()), float(far.max())
 

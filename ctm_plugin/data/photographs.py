@@ -12,7 +12,7 @@ import numpy as np
 from ctm_plugin.data.readers.folders import (
     IMAGE_SUFFIXES,
     RAW_HINT,
-    RAWS,
+    RAW_SUFFIXES,
     fold,
     folded,
     inside,
@@ -23,10 +23,10 @@ from ctm_plugin.data.readers.folders import (
 )
 from ctm_plugin.errors import DataError
 
-FEWEST = 3
-"""Photographs of a scene, at least."""
-MASKS = ("mask", "image_masks", "images_mask", "images_masks")
-"""What others call the folder ``masks``."""
+MIN_PHOTOGRAPHS = 3
+"""Least number of photographs of a scene."""
+MASK_FOLDERS = ("mask", "image_masks", "images_mask", "images_masks")
+"""Other programs' names of the folder ``masks``."""
 
 
 def list_pictures(root: Path, folder: Path) -> list[Path]:
@@ -34,7 +34,7 @@ def list_pictures(root: Path, folder: Path) -> list[Path]:
     names = sorted(path.name for path in folder.iterdir() if is_picture(path))
     if not names:
         there = sorted(folder.iterdir())
-        raw = any(path.suffix.lower() in RAWS for path in there)
+        raw = any(path.suffix.lower() in RAW_SUFFIXES for path in there)
         expected = f"files ending in {', '.join(IMAGE_SUFFIXES)}; {RAW_HINT if raw else others_hint(there)}"
         raise DataError(folder, "no pictures", expected)
     return [inside(root, f"{folder.name}/{name}") for name in names]
@@ -63,10 +63,10 @@ def has_shrunk(root: Path, whole_factor: int) -> bool:
     ready, whole = root / f"images_{whole_factor}", root / "images"
     if whole_factor == 1 or not ready.is_dir():
         return False
-    found, wanted = (sum(map(is_picture, each.rglob("*"))) for each in (ready, whole))
-    if found < wanted:
-        warnings.warn(f"{ready} holds {found} of {wanted} pictures: {whole} is taken and shrunk", stacklevel=2)
-    return found >= wanted
+    count, wanted = (sum(map(is_picture, each.rglob("*"))) for each in (ready, whole))
+    if count < wanted:
+        warnings.warn(f"{ready} holds {count} of {wanted} pictures: {whole} is taken and shrunk", stacklevel=2)
+    return count >= wanted
 
 
 def masks_beside(root: Path, names: Sequence[PurePath]) -> list[Path | None]:
@@ -76,7 +76,7 @@ def masks_beside(root: Path, names: Sequence[PurePath]) -> list[Path | None]:
     """
     folder = folded(root).get("masks")
     if folder is None or not folder.is_dir():
-        for other in (folded(root).get(name) for name in MASKS):
+        for other in (folded(root).get(name) for name in MASK_FOLDERS):
             if other is not None and other.is_dir():
                 warnings.warn(f"{other}: not looked at; masks are to lie in {root / 'masks'}", stacklevel=2)
         return [None] * len(names)
@@ -94,8 +94,8 @@ def masks_beside(root: Path, names: Sequence[PurePath]) -> list[Path | None]:
         expected = f"{missing[0]}.png and so on, or no folder masks"
         raise DataError(folder, f"no mask of any picture{lies}", expected)
     if missing:
-        told = f"all pixels count of {len(missing)} of {len(names)} pictures, which have no mask, such as {missing[0]}"
-        warnings.warn(f"{folder}: {told}", stacklevel=2)
+        text = f"all pixels count of {len(missing)} of {len(names)} pictures, which have no mask, such as {missing[0]}"
+        warnings.warn(f"{folder}: {text}", stacklevel=2)
     return masks
 
 
@@ -105,21 +105,21 @@ def find_listed(root: Path, name: str, source: Path) -> Path | None:
     One of a kind that is read here goes before one of another, such as ``a.jpg`` before ``a.BMP``.
     """
     path = PurePosixPath(plain_name(name))
-    found = look_for(root, name, source)
-    if found is None or found.suffix.lower() not in IMAGE_SUFFIXES:
+    file = look_for(root, name, source)
+    if file is None or file.suffix.lower() not in IMAGE_SUFFIXES:
         developed = look_for(root, str(path.parent / path.stem), source)
-        if found is not None and developed is None and found.suffix.lower() in RAWS:
-            raise DataError(found, "a raw picture", RAW_HINT)
-        return developed or found
-    return found
+        if file is not None and developed is None and file.suffix.lower() in RAW_SUFFIXES:
+            raise DataError(file, "a raw picture", RAW_HINT)
+        return developed or file
+    return file
 
 
-def existing(root: Path, found: Sequence[Path | None], names: Sequence[str], source: Path) -> list[int]:
+def existing(root: Path, paths: Sequence[Path | None], names: Sequence[str], source: Path) -> list[int]:
     """Numbers of the pictures that are there, which ``source`` calls by these names; one warning counts the others."""
-    missing = [name for path, name in zip(found, names, strict=True) if path is None]
+    missing = [name for path, name in zip(paths, names, strict=True) if path is None]
     left = len(names) - len(missing)
-    if left < FEWEST:
-        what, expected = f"{left} pictures", f"at least {FEWEST} whose files exist"
+    if left < MIN_PHOTOGRAPHS:
+        what, expected = f"{left} pictures", f"at least {MIN_PHOTOGRAPHS} whose files exist"
         if missing:
             what += f"; {len(missing)} that it lists are missing, such as {missing[0]!r}"
             path = PurePosixPath(plain_name(missing[0]))
@@ -133,7 +133,7 @@ def existing(root: Path, found: Sequence[Path | None], names: Sequence[str], sou
     if missing:
         message = f"{source}: {len(missing)} of {len(names)} pictures are missing and left out, such as {missing[0]!r}"
         warnings.warn(message, stacklevel=2)
-    return [number for number, path in enumerate(found) if path is not None]
+    return [number for number, path in enumerate(paths) if path is not None]
 
 
 def every(step: int, count: int) -> np.ndarray:

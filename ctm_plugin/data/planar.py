@@ -13,7 +13,7 @@ from torch import Tensor
 
 from ctm_plugin.color.light import brighten
 from ctm_plugin.data.degrade import add_noise, view_generator
-from ctm_plugin.data.readers.folders import RAW_HINT, RAWS, require_file
+from ctm_plugin.data.readers.folders import RAW_HINT, RAW_SUFFIXES, require_file
 from ctm_plugin.data.readers.images import read_picture, to_8_bits
 from ctm_plugin.data.readers.layouts import layouts
 from ctm_plugin.data.settings import PHOTOGRAPHS, PlanarSettings
@@ -22,9 +22,10 @@ from ctm_plugin.errors import ConfigError, DataError
 from ctm_plugin.rays.homography import patch_corners, pixel_grid, sl3_exp, to_pixels, warp
 from ctm_plugin.scene.views import PlanarScene
 
-TOWARDS = torch.tensor([(0.0, 0.0), (-1.0, -1.0), (-1.0, 1.0), (1.0, -1.0), (1.0, 1.0)])
-"""Where each patch is moved: one stays in the middle, one goes to each corner."""
-TRIES = 10_000
+PATCH_DIRECTIONS = torch.tensor([(0.0, 0.0), (-1.0, -1.0), (-1.0, 1.0), (1.0, -1.0), (1.0, 1.0)])
+"""Directions that the patches are moved in: none for the middle one, a corner for each of the others."""
+MAX_DRAWS = 10_000
+"""Most homographies drawn before the magnitude is refused."""
 
 
 class PlanarConfig(PlanarSettings):
@@ -56,7 +57,7 @@ def photograph(image: str | Path) -> Path:
     if str(image) in PHOTOGRAPHS:
         return Path(str(files("skimage.data").joinpath(PHOTOGRAPHS[str(image)])))
     path = Path(image)
-    if path.suffix.lower() in RAWS:
+    if path.suffix.lower() in RAW_SUFFIXES:
         raise DataError(path, "a raw picture", RAW_HINT)
     if path.is_dir() and (there := layouts(path)):
         raise DataError(path, "a folder", f"a picture (dataset.image); dataset={there[0]} dataset.root={path} reads it")
@@ -102,11 +103,11 @@ def draw_warps(config: PlanarConfig) -> Float[Tensor, "5 8"]:
         ConfigError: none was found.
     """
     corners = patch_corners(config.height, config.width, config.patch)
-    warps = torch.zeros(len(TOWARDS), 8)
+    warps = torch.zeros(len(PATCH_DIRECTIONS), 8)
     size = torch.tensor([config.width, config.height])
-    for index in range(1, len(TOWARDS)):
-        drawn = config.noise_h * Draws(config.seed, index, stream="warps").normal(TRIES, 8)
-        drawn[:, :2] += config.noise_t * TOWARDS[index]
+    for index in range(1, len(PATCH_DIRECTIONS)):
+        drawn = config.noise_h * Draws(config.seed, index, stream="warps").normal(MAX_DRAWS, 8)
+        drawn[:, :2] += config.noise_t * PATCH_DIRECTIONS[index]
         at = to_pixels(warp(corners, sl3_exp(drawn)), config.height, config.width)
         fits = ((at >= 0) & (at <= size)).all(-1).all(-1).nonzero()
         if not len(fits):

@@ -17,17 +17,18 @@ from ctm_plugin.data.readers.layouts import model_folder
 from ctm_plugin.data.readers.ply import read_ply
 from ctm_plugin.data.readers.records import Record
 from ctm_plugin.errors import DataError
-from ctm_plugin.scene.poses import MAX_COORDINATE, STILL, Similarity, similarity
+from ctm_plugin.scene.poses import IDENTITY, MAX_COORDINATE, Similarity, similarity
 from ctm_plugin.scene.views import Points
 
-SHARED = 3
-"""Pictures that two files share, at least, for their cameras to be compared."""
-TRAINING = 2
-"""Training pictures that see a point, at least, where there are such points: others say little of those."""
-OFF, TURNED = 0.01, 0.0175
-"""How far cameras of two files may be apart to be the same: a part of their spread, and one degree."""
+MIN_SHARED = 3
+"""Least number of pictures that two files must share for their cameras to be compared."""
+MIN_VIEWS = 2
+"""Least number of training pictures that observe a point, where there are such points: others are less certain."""
+MAX_OFFSET, MAX_ANGLE = 0.01, 0.0175
+"""Largest difference of two files' cameras that count as the same: a share of their spread, and one degree in
+radians."""
 Poses = Sequence[tuple[str, Float64[np.ndarray, "3 4"]]]
-"""Pictures' names and their cameras, camera to world."""
+"""Names of pictures with their cameras, camera to world."""
 
 
 class Cloud(NamedTuple):
@@ -43,16 +44,16 @@ class Cloud(NamedTuple):
 
     name: str
     positions: Float64[np.ndarray, "p 3"]
-    world: Similarity = STILL
+    world: Similarity = IDENTITY
     taken: Sequence[Taken] = ()
     tracks: Sequence[Int64[np.ndarray, " _"]] = ()
 
 
-Found = tuple[Cloud | None, str]
-"""Points, or why there are none."""
+PointsOrReason = tuple[Cloud | None, str]
+"""A cloud of points and an empty reason, or ``None`` and why there is none."""
 
 
-def read_cloud(name: str, taken: Sequence[Taken], path: Path, world: Similarity = STILL) -> Cloud:
+def read_cloud(name: str, taken: Sequence[Taken], path: Path, world: Similarity = IDENTITY) -> Cloud:
     """Read COLMAP's ``points3D.bin``, with the tracks of these pictures."""
     numbers, positions = read_points(path)
     seen = [np.unique(picture.points) for picture in taken]
@@ -60,7 +61,7 @@ def read_cloud(name: str, taken: Sequence[Taken], path: Path, world: Similarity 
     return Cloud(name, positions, world, taken, tracks)
 
 
-def model_beside(root: Path, poses: Poses) -> Found:
+def model_beside(root: Path, poses: Poses) -> PointsOrReason:
     """Find the points of COLMAP's model next to other files, where its cameras are theirs up to a similarity."""
     folder = model_folder(root)
     if folder is None:
@@ -71,10 +72,10 @@ def model_beside(root: Path, poses: Poses) -> Found:
         ours = dict(poses)
         names = paired([each.name for each in taken], list(ours))
         same = [each._replace(name=names[each.name]) for each in taken if each.name in names]
-        if len(same) < SHARED:
+        if len(same) < MIN_SHARED:
             return None, f"{name} has {len(same)} of the pictures"
         world = similarity(np.stack([each.c2w for each in same]), np.stack([ours[each.name] for each in same]))
-        if world.off > OFF or world.angle > TURNED:
+        if world.off > MAX_OFFSET or world.angle > MAX_ANGLE:
             off = f"{100 * world.off:.2g} % of their spread and {np.degrees(world.angle):.2g} degrees off"
             return None, f"the cameras of {name} are others, {off}"
         return read_cloud(name, same, model_file(folder, "points3D"), world), ""
@@ -98,7 +99,7 @@ def paired(theirs: Sequence[str], ours: Sequence[str]) -> dict[str, str]:
     return {name: ends[end] for end, name in alone(theirs).items() if end in ends}
 
 
-def ply_named(root: Path, record: Record) -> Found:
+def ply_named(root: Path, record: Record) -> PointsOrReason:
     """Find the points of the ``ply_file_path`` that a file names, in the world of its poses."""
     if not record.values.get("ply_file_path"):
         return None, ""
@@ -114,17 +115,17 @@ def points_of(cloud: Cloud, names: Sequence[str]) -> Points | None:
     point, view = np.concatenate(seen), np.repeat(np.arange(len(names)), [len(each) for each in seen])
     positions = cloud.world.moved(cloud.positions)
     times = np.bincount(point, minlength=len(positions))
-    kept = (times >= min(TRAINING, times.max(initial=0))) & (np.abs(positions) <= MAX_COORDINATE).all(1)
+    kept = (times >= min(MIN_VIEWS, times.max(initial=0))) & (np.abs(positions) <= MAX_COORDINATE).all(1)
     row, there = np.cumsum(kept) - 1, kept[point]
     parts = (positions[kept].astype(np.float32), row[point[there]], view[there])
     return Points(*map(torch.from_numpy, parts)) if kept.any() else None
 
 
-def first_points(names: Sequence[str], *reads: Callable[[], Found]) -> Points | None:
+def first_points(names: Sequence[str], *reads: Callable[[], PointsOrReason]) -> Points | None:
     """Take the first points that are there and can be read, see :func:`points_of`; ``None`` where there are none."""
     for read in reads:
         with suppress(DataError):  # no scene needs points: what does has read them before
             cloud, _ = read()
-            if cloud is not None and (found := points_of(cloud, names)) is not None:
-                return found
+            if cloud is not None and (points := points_of(cloud, names)) is not None:
+                return points
     return None

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from ctm_plugin.data.capture import Capture
 from ctm_plugin.data.llff import LLFFConfig
-from ctm_plugin.data.readers.folders import RAWS, fold, folded, inside
+from ctm_plugin.data.readers.folders import RAW_SUFFIXES, fold, folded, inside
 from ctm_plugin.data.readers.images import read_picture
 from ctm_plugin.data.readers.layouts import open_layout
 from ctm_plugin.data.readers.raw import open_raw, raw_exposure
@@ -35,13 +35,13 @@ class RawNeRFConfig(RawNeRFSettings, LLFFConfig):
 
         The scene's exposure is not known.
         """
-        root = open_layout(Path(self.root) / (self.scene or ""), self.layout, self.links)
+        root = open_layout(Path(self.root) / (self.scene or ""), self.layout)
         developed = self.factor or any((root / name).is_dir() for name in ("images", f"images_{self.whole_factor}"))
         if developed or not (root / "raw").is_dir():
             return self.posed(root, *self.developed(root))
-        names = sorted(path.name for path in (root / "raw").iterdir() if path.suffix.lower() in RAWS)
+        names = sorted(path.name for path in (root / "raw").iterdir() if path.suffix.lower() in RAW_SUFFIXES)
         if not names:
-            raise DataError(root / "raw", "no raw pictures", f"files ending in {', '.join(RAWS)}")
+            raise DataError(root / "raw", "no raw pictures", f"files ending in {', '.join(RAW_SUFFIXES)}")
         paths = [inside(root, f"raw/{name}") for name in names]
         beside = folded(root / "raw")
         exif = [beside.get(fold(f"{path.stem}.json"), path.with_suffix(".json")) for path in paths]
@@ -49,8 +49,8 @@ class RawNeRFConfig(RawNeRFSettings, LLFFConfig):
         pictures = [read_picture(path, partial(open_raw, brightness=f)) for path, f in zip(paths, factors, strict=True)]
         return self.posed(root, pictures, shrunk=False)
 
-    def load(self) -> Scene:
-        return replace(super().load(), exposure=None)
+    def load(self, capture: Capture | None = None) -> Scene:
+        return replace(super().load(capture), exposure=None)
 
 
 def relative_brightness(records: list[Path], raws: list[Path]) -> list[float]:

@@ -9,18 +9,19 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64
 
-from ctm_plugin.data.readers.lens import Camera
+from ctm_plugin.data.readers.lens import Intrinsics
 from ctm_plugin.scene.kinds import GEOMETRIES, Geometry
 from ctm_plugin.scene.poses import meeting_depths, meeting_point
 
-STEEPEST = math.radians(80)
-"""Angle between the mean axis and any ray, below which planes in NDC resolve the picture's edge."""
-BEHIND = 0.7
-"""How far before the mean camera another may stand, in depths of what is nearest: NDC's near plane lies at 0.75."""
-NEAREST = 0.4
-"""That depth where nobody tells it, in depths of where the axes meet."""
-ROUND = 270.0
-"""Degrees from which on cameras go round a thing."""
+MAX_NDC_ANGLE = math.radians(80)
+"""Largest angle in radians between the mean axis and a ray at which NDC's planes still resolve the picture's edge."""
+MAX_ADVANCE = 0.7
+"""Largest distance of a camera in front of the mean one, as a share of the nearest depth: NDC's near plane lies at
+0.75."""
+ASSUMED_NEAR = 0.4
+"""Nearest depth where none is known, as a share of the depth at which the axes meet."""
+SURROUND_DEGREES = 270.0
+"""Degrees that cameras cover from which they go round an object."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +53,7 @@ class Rig:
     @property
     def looks_one_way(self) -> bool:
         """Whether all rays go the same way from cameras that stand in a layer: what NDC is for."""
-        if self.angle + self.corner >= STEEPEST:
+        if self.angle + self.corner >= MAX_NDC_ANGLE:
             return False
         mean = -self.c2w[:, :, 2].sum(0)
         along = self.c2w[:, :, 3] @ mean / np.linalg.norm(mean)
@@ -60,8 +61,8 @@ class Rig:
         if near is None:
             depths = meeting_depths(self.c2w)
             spread = np.linalg.norm(self.c2w[:, :, 3] - self.c2w[:, :, 3].mean(0), axis=1).max()
-            near = NEAREST * float(spread if depths is None else depths.min())
-        return bool(along.max() - along.mean() <= BEHIND * near)
+            near = ASSUMED_NEAR * float(spread if depths is None else depths.min())
+        return bool(along.max() - along.mean() <= MAX_ADVANCE * near)
 
     def geometry(self, among: Sequence[str] = GEOMETRIES) -> tuple[Geometry, str]:
         """Choose the geometry, of those that a backbone has, and say why."""
@@ -73,7 +74,7 @@ class Rig:
 
 
 def rig_of(
-    cameras: Iterable[Camera],
+    cameras: Iterable[Intrinsics],
     poses: Sequence[Float64[np.ndarray, "3 4"]],
     size: tuple[int, int],
     alone: bool,

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Int64
@@ -17,12 +16,12 @@ from ctm_plugin.settings.setting import REQUIRED, Number, Settings, setting
 PHOTOGRAPHS = {
     "astronaut": "astronaut.png", "chelsea": "chelsea.png", "coffee": "coffee.png", "rocket": "rocket.jpg",
 }  # fmt: skip
-"""Colour photographs that come with scikit-image, by name."""
+"""File names of scikit-image's colour photographs by their names."""
 RAWNERF_SCENES = (
     "bikes", "candlefiat", "livingroom", "morningkitchen", "nightstreet", "notchbush", "parkstatue", "scooter",
     "streetcorner",
 )  # fmt: skip
-"""The nine that the paper took."""
+"""RawNeRF's scenes that the paper uses."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -87,13 +86,6 @@ class PhotoConfig(DimConfig):
         if self.width is not None and self.downscale != type(self).__dataclass_fields__["downscale"].default:
             raise self.fault("width", f"null with dataset.downscale={self.downscale}")
 
-    def rig(self) -> Any:
-        """Read how the cameras stand, a :class:`~ctm_plugin.data.rig.Rig`, without the pictures.
-
-        ``None``: the layout does not tell.
-        """
-        return None
-
     @property
     def whole_factor(self) -> int:
         """The factor of a folder ``images_<factor>`` that may hold the pictures already shrunk; 1: none may."""
@@ -123,7 +115,7 @@ class PhotoConfig(DimConfig):
 class FolderConfig(PhotoConfig):
     """Photographs in a folder.
 
-    PNG, JPEG, WebP, TIFF and EXR are read. Floats are linear light; EXR needs the extra ``exr``. Pictures of 8 bits are
+    PNG, JPEG, WebP, TIFF and EXR are read. Floats are linear light. Pictures of 8 bits are
     kept in 8 bits. Where one has more, all are kept in float32, in four times the memory. Pixels of shrunk pictures are
     means over areas.
 
@@ -139,7 +131,6 @@ class FolderConfig(PhotoConfig):
     """
 
     root: str | Path = setting(REQUIRED, "folder of the data set")
-    links: bool = setting(True, "whether the folder may hold links to files outside it")
 
     def __post_init__(self) -> None:
         super().__post_init__()

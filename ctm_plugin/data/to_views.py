@@ -16,8 +16,8 @@ from torch import Tensor
 from ctm_plugin.data.capture import Capture, Photograph
 from ctm_plugin.data.develop import develop, develop_depth, develop_masks, means_matter
 from ctm_plugin.data.readers.images import to_8_bits
-from ctm_plugin.data.readers.lens import PINHOLE, Camera, check_lens
-from ctm_plugin.data.readers.picture import UPRIGHT, Header
+from ctm_plugin.data.readers.lens import PINHOLE, Intrinsics, check_lens
+from ctm_plugin.data.readers.picture import UPRIGHT_ORIENTATION, Header
 from ctm_plugin.data.settings import BoundsConfig, PhotoConfig
 from ctm_plugin.errors import ConfigError, DataError
 from ctm_plugin.scene.views import Views
@@ -83,8 +83,8 @@ def upright(photographs: Sequence[Photograph], source: Path) -> list[Photograph]
         return turned and (header.width - header.height) * (camera.width - camera.height) < 0
 
     if paths := [each.path for each in photographs if lies(each)]:
-        told = f"{len(set(paths))} pictures are read as they are stored, without EXIF's rotation"
-        warnings.warn(f"{min(paths)}: {told}, as {source.name} has them", stacklevel=3)
+        warning = f"{len(set(paths))} pictures are read as they are stored, without EXIF's rotation"
+        warnings.warn(f"{min(paths)}: {warning}, as {source.name} has them", stacklevel=3)
     return [replace(each, picture=each.picture.as_stored()) if lies(each) else each for each in photographs]
 
 
@@ -92,7 +92,7 @@ def headers_of(photographs: Sequence[Photograph]) -> list[Header]:
     """Each picture's header; of one that is not there, the size of that whose sides are most like its camera's."""
     known = [each.picture.header for each in photographs if each.picture]
 
-    def like(camera: Camera) -> Header:
+    def like(camera: Intrinsics) -> Header:
         nearest = min(known, key=lambda header: abs(header.width * camera.height - header.height * camera.width))
         return Header(nearest.height, nearest.width, alpha=False)
 
@@ -112,18 +112,18 @@ def on_one_canvas(
             width, height = max(given)
             config.shrunk(height, width)
             config = replace(config, width=None, downscale=width / config.width)
-        told = ", ".join(f"{width}x{height}" for width, height in sorted(given)[:4])
-        what = f"pictures of {len(given)} sizes ({told}): they are put on one canvas, whose pixels outside them"
+        text = ", ".join(f"{width}x{height}" for width, height in sorted(given)[:4])
+        what = f"pictures of {len(given)} sizes ({text}): they are put on one canvas, whose pixels outside them"
         warnings.warn(f"{source}: {what} do not count", stacklevel=3)
     sizes = [config.shrunk(header.height, header.width) for header in headers]
     return config, sizes, (max(height for height, _ in sizes), max(width for _, width in sizes))
 
 
-def camera_of(photograph: Photograph, header: Header, source: Path, crop: tuple[int, ...] | None) -> Camera:
-    """The camera of a photograph's file as it is shown, see :meth:`~ctm_plugin.data.readers.lens.Camera.of_picture`."""
+def camera_of(photograph: Photograph, header: Header, source: Path, crop: tuple[int, ...] | None) -> Intrinsics:
+    """Intrinsics of a photograph, upright, see :meth:`~ctm_plugin.data.readers.lens.Intrinsics.of_picture`."""
     path, camera, (height, width, *_) = photograph.path, photograph.camera, header
-    told = photograph.shown or (header.orientation > 4 and (width - height) * (camera.width - camera.height) > 0)
-    if header.orientation != UPRIGHT and not told:
+    turned = photograph.shown or (header.orientation > 4 and (width - height) * (camera.width - camera.height) > 0)
+    if header.orientation != UPRIGHT_ORIENTATION and not turned:
         found = f"a picture that EXIF's orientation {header.orientation} turns to {width}x{height}"
         said = f"{camera.width:g}x{camera.height:g}, as {camera.where} of {source.name}"
         expected = f"{said}, beyond doubt: take the tag off, or find the cameras anew by ctm cameras"
@@ -133,8 +133,8 @@ def camera_of(photograph: Photograph, header: Header, source: Path, crop: tuple[
 
 def exposures_told(headers: Sequence[Header]) -> Float32[Tensor, " n"] | None:
     """The light ``[N]`` that pictures took by their EXIF; NaN where it does not tell, ``None`` where none does."""
-    told = torch.tensor([math.nan if header.exposure is None else header.exposure for header in headers])
-    return None if told.isnan().all() else told
+    exposures = torch.tensor([math.nan if header.exposure is None else header.exposure for header in headers])
+    return None if exposures.isnan().all() else exposures
 
 
 def develop_lit(

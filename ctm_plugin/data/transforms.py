@@ -12,16 +12,16 @@ from typing import NamedTuple
 import numpy as np
 
 from ctm_plugin.data.capture import Capture, Photograph
-from ctm_plugin.data.develop import DYNAMIC
+from ctm_plugin.data.develop import DYNAMIC_PREFIX
 from ctm_plugin.data.lit import as_captured, check_folder
 from ctm_plugin.data.load import Layout
 from ctm_plugin.data.photographs import every, existing, find_listed, has_shrunk, masks_beside
 from ctm_plugin.data.points import model_beside, ply_named
 from ctm_plugin.data.readers.folders import inside, plain_name
-from ctm_plugin.data.readers.frames import SIZE, check_keys, frames_of, read_camera, read_pose
-from ctm_plugin.data.readers.images import Picture, read_picture
+from ctm_plugin.data.readers.frames import SIZE_KEYS, check_keys, frames_of, read_camera, read_pose
+from ctm_plugin.data.readers.images import PictureFile, read_picture
 from ctm_plugin.data.readers.layouts import TEST, TRAIN, TRANSFORMS, VAL, open_layout
-from ctm_plugin.data.readers.lens import Camera
+from ctm_plugin.data.readers.lens import Intrinsics
 from ctm_plugin.data.readers.records import Record, read_record
 from ctm_plugin.data.settings import TransformsSettings
 from ctm_plugin.errors import ConfigError, DataError
@@ -52,7 +52,7 @@ class TransformsConfig(Layout, TransformsSettings):
         Training views whose picture is missing are left out, test views are kept without it, each with one warning.
         Where a file is listed under ``images`` and there is a folder ``images_<downscale>``, its picture is taken.
         """
-        root = open_layout(self.root, self.layout, self.links)
+        root = open_layout(self.root, self.layout)
         check_folder(root, "dataset.dark", self.dark)
         check_folder(root, "dataset.lit", self.lit)
         return capture_of(root, read_files(root), self.dark, self.lit, self.test_every, self.whole_factor)
@@ -123,18 +123,18 @@ def capture_of(
     photographs: list[Photograph] = []
     remarks: dict[str, str] = {}
     for each in (*train, *test):
-        if several and not synthetic and not all(key in each.frame or key in each.record for key in SIZE):
+        if several and not synthetic and not all(key in each.frame or key in each.record for key in SIZE_KEYS):
             raise each.frame.fault("w", "w and h of each frame's picture: there are several sizes")
         size = pictures.get(each.path, first).header
         camera = read_camera(each.record, each.frame, factor * size.width, factor * size.height, remarks)
-        found = photograph(root, each, camera, pictures.get(each.path), factor)
+        taken = photograph(root, each, camera, pictures.get(each.path), factor)
         if depths and each.testing:
             name = each.frame.text("depth_file_path", "the depth picture's path")
             depth = find_listed(root, name, each.record.source)
             if depth is None:
                 raise each.frame.fault("depth_file_path", "the path of a picture that is there")
-            found = replace(found, depth=depth)
-        photographs.append(replace(found, shown=synthetic))
+            taken = replace(taken, depth=depth)
+        photographs.append(replace(taken, shown=synthetic))
     for remark in remarks.values():
         warnings.warn(f"{source}: {remark}", stacklevel=2)
     if not (synthetic or any(each.mask for each in photographs)):
@@ -234,17 +234,17 @@ def split(listed: list[Listed], source: Path, test_every: int) -> tuple[list[Lis
         raise DataError(source, found, "at least one for each: see train_filenames and test_filenames")
     missing = [each.name or each.lit for each in testing if each.path is None]
     if missing:
-        told = f"{len(missing)} of {len(testing)} test views have no picture to score against, such as {missing[0]!r}"
-        warnings.warn(f"{testing[0].record.source}: {told}: they are only rendered", stacklevel=3)
+        text = f"{len(missing)} of {len(testing)} test views have no picture to score against, such as {missing[0]!r}"
+        warnings.warn(f"{testing[0].record.source}: {text}: they are only rendered", stacklevel=3)
     trained = {each.name for each in training}
     both = [each.name for each in testing if each.name in trained]
     if both:
-        told = f"{len(both)} of {len(testing)} test views are also trained on, such as {both[0]!r}"
-        warnings.warn(f"{testing[0].record.source}: {told}: their scores say little", stacklevel=3)
+        text = f"{len(both)} of {len(testing)} test views are also trained on, such as {both[0]!r}"
+        warnings.warn(f"{testing[0].record.source}: {text}: their scores say little", stacklevel=3)
     return training, testing
 
 
-def photograph(root: Path, each: Listed, camera: Camera, picture: Picture | None, factor: int) -> Photograph:
+def photograph(root: Path, each: Listed, camera: Intrinsics, picture: PictureFile | None, factor: int) -> Photograph:
     """The photograph of a frame, with the mask of the shrunk ones where ``factor`` says that there are such."""
     source, mask, lit = each.record.source, None, None
     if each.frame.values.get("mask_path"):
@@ -252,7 +252,7 @@ def photograph(root: Path, each: Listed, camera: Camera, picture: Picture | None
         mask = find_listed(root, resized(root, name, factor), source)
         if mask is None:
             raise each.frame.fault("mask_path", "the path of a picture that is there")
-    elif each.path and (beside := each.path.with_name(f"{DYNAMIC}{each.path.stem}.png")).is_file():
+    elif each.path and (beside := each.path.with_name(f"{DYNAMIC_PREFIX}{each.path.stem}.png")).is_file():
         mask = beside
     if each.testing and each.lit is not None:
         lit = find_listed(root, each.lit, source)

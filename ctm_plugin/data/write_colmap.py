@@ -10,14 +10,14 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from scipy.spatial.transform import Rotation
 
-from ctm_plugin.data.readers.colmap_model import NAMES, PARAMETERS, Taken
-from ctm_plugin.data.readers.lens import PINHOLE, Camera
+from ctm_plugin.data.readers.colmap_model import MODEL_NAMES, MODEL_PARAMETERS, Taken
+from ctm_plugin.data.readers.lens import PINHOLE, Intrinsics
 from ctm_plugin.files import replacing
 
 
 def write_model(
     folder: Path,
-    cameras: Sequence[Camera],
+    cameras: Sequence[Intrinsics],
     taken: Sequence[Taken],
     places: Sequence[Float[np.ndarray, "_ 2"]],
     positions: Float[np.ndarray, "p 3"],
@@ -46,13 +46,13 @@ def write_model(
             beside.write_bytes(struct.pack("<Q", len(rows)) + b"".join(rows))
 
 
-def packed_camera(number: int, camera: Camera) -> bytes:
+def packed_camera(number: int, camera: Intrinsics) -> bytes:
     """Pack a camera as the smallest of COLMAP's models that has its distortion."""
     k1, k2, p1, p2, k3 = camera.distortion
     name = "FULL_OPENCV" if k3 else "PINHOLE" if camera.distortion == PINHOLE else "OPENCV"
-    values = (*camera.pinhole, k1, k2, p1, p2, k3, 0.0, 0.0, 0.0)[: PARAMETERS[name]]
+    values = (*camera.pinhole, k1, k2, p1, p2, k3, 0.0, 0.0, 0.0)[: MODEL_PARAMETERS[name]]
     size = int(camera.width), int(camera.height)
-    return struct.pack(f"<iiQQ{len(values)}d", number, NAMES.index(name), *size, *values)
+    return struct.pack(f"<iiQQ{len(values)}d", number, MODEL_NAMES.index(name), *size, *values)
 
 
 def packed_picture(number: int, seen: tuple[Taken, Float[np.ndarray, "_ 2"]]) -> bytes:

@@ -9,8 +9,8 @@ from triton import cdiv, next_power_of_2
 
 from ctm_plugin.gpu.kernels import kernel, launch
 
-NUMBERS = 1024
-"""Of a table, that a program steps."""
+ELEMENT_BLOCK = 1024
+"""Elements of a table that one program of the kernel steps."""
 
 
 def step_table(
@@ -26,7 +26,7 @@ def step_table(
         raise ValueError("tables that are not contiguous")
     grad, (beta1, beta2) = (grad.to_dense() if grad.is_sparse else grad).contiguous(), betas
     width = next_power_of_2(table.shape[1])
-    rows = max(1, NUMBERS // width)
+    rows = max(1, ELEMENT_BLOCK // width)
     launch(
         _step, (cdiv(len(table), rows),),
         table.detach(), grad, exp_avg, exp_avg_sq, table if rates is None else rates.contiguous(), len(table),

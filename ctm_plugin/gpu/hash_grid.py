@@ -11,31 +11,32 @@ from triton import cdiv, next_power_of_2
 from ctm_plugin.gpu.kernels import kernel, launch, whole
 from ctm_plugin.gpu.lookup import cell, place
 
-BLOCK = 128
-"""Points of a program."""
+POINT_BLOCK = 128
+"""Points that one program of the kernel looks up."""
 PRIME_Y: tl.constexpr = tl.constexpr(2654435761)
+"""Primes that the second and third coordinate of a vertex are multiplied by."""
 PRIME_Z: tl.constexpr = tl.constexpr(805459861)
 
 
 def encoded(table: Tensor, points: Tensor, sides: Tensor, starts: Tensor) -> Tensor:
     """Do as :func:`ctm_plugin.rays.hash_grid.encoded`."""
-    found = points.new_empty(len(points), len(sides) * table.shape[1])
-    _go_over(table.detach().contiguous(), points, sides, starts, found, back=False)
-    return found
+    features = points.new_empty(len(points), len(sides) * table.shape[1])
+    _go_over(table.detach().contiguous(), points, sides, starts, features, back=False)
+    return features
 
 
 def spread(grad: Tensor, points: Tensor, sides: Tensor, starts: Tensor, shape: torch.Size) -> Tensor:
     """Do as :func:`ctm_plugin.rays.hash_grid.spread`, in any order."""
-    found = grad.new_zeros(shape)
-    _go_over(found, points, sides, starts, grad.contiguous(), back=True)
-    return found
+    table_grad = grad.new_zeros(shape)
+    _go_over(table_grad, points, sides, starts, grad.contiguous(), back=True)
+    return table_grad
 
 
 def _go_over(table: Tensor, points: Tensor, sides: Tensor, starts: Tensor, numbers: Tensor, back: bool) -> None:
     (count, _), features, levels = points.shape, table.shape[1], len(sides)
-    sizes = {"LEVELS": levels, "FEATURES": features, "WIDTH": next_power_of_2(features), "BLOCK": BLOCK}
+    sizes = {"LEVELS": levels, "FEATURES": features, "WIDTH": next_power_of_2(features), "BLOCK": POINT_BLOCK}
     given = table, points, *points.stride(), *whole(sides, starts), numbers, count
-    launch(_look_up, (cdiv(count, BLOCK), levels), *given, BACK=back, **sizes)
+    launch(_look_up, (cdiv(count, POINT_BLOCK), levels), *given, BACK=back, **sizes)
 
 
 @kernel

@@ -10,14 +10,15 @@ import torch
 import triton
 from torch import Tensor
 
-PLAIN = {"count", "along", "across"}
-"""Integers that change from step to step: kernels are not compiled anew for those that divide by 16 or are 1."""
+VARYING = {"count", "along", "across"}
+"""Names of integer arguments that change from step to step; Triton compiles no variant for those that divide by 16 or
+are 1."""
 
 
 def kernel(function: Callable) -> Any:
     """Make a function a Triton kernel, or a part of one, compiled when it is first launched."""
     raw = inspect.unwrap(function)  # type checkers of tests wrap functions
-    return triton.jit(raw, do_not_specialize=[name for name in inspect.signature(raw).parameters if name in PLAIN])
+    return triton.jit(raw, do_not_specialize=[name for name in inspect.signature(raw).parameters if name in VARYING])
 
 
 def launch(of: Any, programs: tuple[int, ...], *arguments: Any, **options: Any) -> None:

@@ -9,10 +9,10 @@ from triton import cdiv, next_power_of_2
 
 from ctm_plugin.gpu.kernels import kernel, launch, whole
 
-BLOCK = 128
-"""Points of a program."""
-NUMBERS = 512
-"""Of points, that a program of a lookup holds at once."""
+POINTS = 128
+"""Points that one program of the kernel handles."""
+ELEMENT_BLOCK = 512
+"""Features, of all its points, that one program of a lookup holds at once."""
 
 
 def corners(points: Tensor, low: Tensor, scale: Tensor, last: Tensor, offsets: Tensor) -> tuple[Tensor, Tensor]:
@@ -20,7 +20,7 @@ def corners(points: Tensor, low: Tensor, scale: Tensor, last: Tensor, offsets: T
     count = len(points)
     rows, weights = points.new_empty(count, 8, dtype=torch.int32), points.new_empty(count, 8)
     box = whole(low, scale, last, offsets)
-    launch(_corners, (cdiv(count, BLOCK),), points, *points.stride(), *box, rows, weights, count, BLOCK=BLOCK)
+    launch(_corners, (cdiv(count, POINTS),), points, *points.stride(), *box, rows, weights, count, BLOCK=POINTS)
     return rows, weights
 
 
@@ -63,22 +63,22 @@ def _corners(points, along, across, low, scale, last, offsets, rows, weights, co
 
 def weighted(table: Tensor, rows: Tensor, weights: Tensor) -> Tensor:
     """Do as :func:`ctm_plugin.rays.grid.weighted`."""
-    found = table.new_empty(len(rows), table.shape[1])
-    _go_over(*whole(table.detach(), rows, weights), found, back=False)
-    return found
+    values = table.new_empty(len(rows), table.shape[1])
+    _go_over(*whole(table.detach(), rows, weights), values, back=False)
+    return values
 
 
 def scattered(rows: Tensor, weights: Tensor, grad: Tensor, shape: torch.Size, sparse: bool) -> Tensor:
     """Do as :func:`ctm_plugin.rays.grid.scattered`, in any order; never sparse."""
-    found = grad.new_zeros(shape)
-    _go_over(found, *whole(rows, weights, grad), back=True)
-    return found
+    table_grad = grad.new_zeros(shape)
+    _go_over(table_grad, *whole(rows, weights, grad), back=True)
+    return table_grad
 
 
 def _go_over(table: Tensor, rows: Tensor, weights: Tensor, numbers: Tensor, back: bool) -> None:
     channels, (count, corners) = table.shape[1], rows.shape
     width = next_power_of_2(channels)
-    size = max(1, NUMBERS // width)
+    size = max(1, ELEMENT_BLOCK // width)
     constants = {"BACK": back, "CORNERS": corners, "CHANNELS": channels, "WIDTH": width, "BLOCK": size}
     launch(_look_up, (cdiv(count, size),), table, rows, weights, numbers, count, **constants)
 

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import torch
 
-GIBIBYTES = 8
-"""Memory that chunks are made for."""
-MOST = 16
-"""Times a chunk; more rays at once are hardly faster."""
+BASE_GIBIBYTES = 8
+"""Free memory in GiB that chunks are sized for."""
+MAX_SCALE = 16
+"""Largest factor on a chunk; more rays at once are hardly faster."""
 
 
 def times_a_chunk(device: torch.device) -> int:
     """So many chunks fit into its memory where one fits into 8 GiB: few large launches are faster than many small."""
     if device.type != "cuda":
         return 1
-    return min(max(torch.cuda.get_device_properties(device).total_memory // (GIBIBYTES << 30), 1), MOST)
+    return min(max(torch.cuda.get_device_properties(device).total_memory // (BASE_GIBIBYTES << 30), 1), MAX_SCALE)

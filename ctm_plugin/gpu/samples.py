@@ -8,8 +8,8 @@ from torch import Tensor
 from ctm_plugin.gpu.kernels import kernel, launch, whole
 from ctm_plugin.gpu.lookup import place
 
-BLOCK = 64
-"""Samples that a program holds at once."""
+SAMPLE_BLOCK = 64
+"""Samples that one program of the kernel holds at once."""
 
 
 def occupied_samples(
@@ -21,40 +21,13 @@ def occupied_samples(
     The GPU is waited for once, for how many they are.
     """
     given = *whole(origins, directions, first, counts, occupancy, low, scale, last), step
-    kept = _counted(given, contracted)
+    kept, sizes = counts.new_empty(len(counts)), {"CONTRACTED": contracted, "BLOCK": SAMPLE_BLOCK, "num_warps": 2}
+    launch(_find, (len(counts),), *given, kept, kept, first, kept, first, 0, FILL=False, **sizes)
     ends = kept.cumsum(0)
     total = int(ends[-1]) if len(ends) else 0
     t, ray, points = first.new_empty(total), counts.new_empty(total), first.new_empty(3, total)
-    _written(given, contracted, kept, ends, t, ray, points)
+    launch(_find, (len(counts),), *given, kept, ends, t, ray, points, total, FILL=True, **sizes)
     return t, ray, points.T
-
-
-def placed_samples(
-    origins: Tensor, directions: Tensor, first: Tensor, counts: Tensor, step: float, occupancy: Tensor,
-    low: Tensor, scale: Tensor, last: Tensor, offsets: Tensor, contracted: bool, spare: Tensor,
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
-    """Do as :func:`ctm_plugin.rays.occupancy.placed_samples`; nothing is waited for."""
-    given = *whole(origins, directions, first, counts, occupancy, low, scale, last), step
-    kept = _counted(given, contracted)
-    ends = kept.cumsum(0)
-    t, ray, points = first.new_zeros(len(spare)), spare.clone(), first.new_zeros(3, len(spare))
-    _written(given, contracted, kept, ends, t, ray, points)
-    return t, ray, points.T, ends[-1]
-
-
-def _counted(given: tuple, contracted: bool) -> Tensor:
-    first, counts = given[2:4]
-    kept = counts.new_empty(len(counts))
-    sizes = {"CONTRACTED": contracted, "BLOCK": BLOCK, "num_warps": 2}
-    launch(_find, (len(counts),), *given, kept, kept, first, kept, first, 0, FILL=False, **sizes)
-    return kept
-
-
-def _written(
-    given: tuple, contracted: bool, kept: Tensor, ends: Tensor, t: Tensor, ray: Tensor, points: Tensor
-) -> None:
-    sizes = {"CONTRACTED": contracted, "BLOCK": BLOCK, "num_warps": 2}
-    launch(_find, (len(kept),), *given, kept, ends, t, ray, points, len(t), FILL=True, **sizes)
 
 
 @kernel
@@ -69,8 +42,8 @@ def _find(
     origins, directions, first, counts, occupancy, low, scale, last, step, kept, ends, ts, rays, points, across,
     FILL: tl.constexpr, CONTRACTED: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Count a ray's samples in occupied cells; ``FILL``: write them, so that they end where ``ends`` says, those of
-    the first ``across``."""
+    """Count a ray's samples in occupied cells; ``FILL``: write them, so that they end where ``ends`` says, of
+    ``across`` in all."""
     ray, lane = tl.program_id(0).to(tl.int64), tl.arange(0, BLOCK)
     count, start = tl.load(counts + ray), tl.load(first + ray)
     ray_x, to_x = tl.load(origins + 3 * ray), tl.load(directions + 3 * ray)
@@ -92,7 +65,7 @@ def _find(
         hit = tl.load(occupancy + row, mask=begin + lane < count, other=0).to(tl.int32)
         if FILL:
             to = at + tl.cumsum(hit, 0) - 1
-            here = (hit != 0) & (to < end) & (to < across)
+            here = (hit != 0) & (to < end)
             tl.store(ts + to, t, mask=here)
             tl.store(rays + to, ray + lane * 0, mask=here)
             tl.store(points + to, x, mask=here)

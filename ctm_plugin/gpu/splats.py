@@ -13,11 +13,12 @@ from triton import next_power_of_2
 from ctm_plugin.gpu.kernels import kernel, launch, whole
 
 TILE = 16
-"""Pixels a side."""
-ENOUGH = tl.constexpr(1e-4)
-"""A tile is left when less light than this passes each of its pixels; looked at after every ``LOOK`` Gaussians."""
-LOOK = tl.constexpr(16)
-LEAST, MOST = tl.constexpr(1 / 255), tl.constexpr(0.99)
+"""Pixels along a tile's side."""
+MIN_TRANSMITTANCE = tl.constexpr(1e-4)
+"""A tile is done once all its pixels let less light than this pass; tested after every ``GAUSSIANS_PER_TEST``
+Gaussians."""
+GAUSSIANS_PER_TEST = tl.constexpr(16)
+MIN_ALPHA, MAX_ALPHA = tl.constexpr(1 / 255), tl.constexpr(0.99)
 SIDE, PIXELS = tl.constexpr(TILE), tl.constexpr(TILE * TILE)
 
 
@@ -46,9 +47,9 @@ def tiled(means: Tensor, extents: Tensor, depths: Tensor, wide: int, high: int) 
     order = depths.argsort(stable=True)
     means, extents = means[order], extents[order]
     shown = (extents > 0).all(1, keepdim=True)
-    most = means.new_tensor([wide, high])
-    first = torch.minimum(((means - extents) / TILE).floor().clamp_min(0), most).long()
-    last = torch.minimum(((means + extents) / TILE).ceil().clamp_min(0), most).long()
+    limit = means.new_tensor([wide, high])
+    first = torch.minimum(((means - extents) / TILE).floor().clamp_min(0), limit).long()
+    last = torch.minimum(((means + extents) / TILE).ceil().clamp_min(0), limit).long()
     columns, rows = ((last - first).clamp_min(0) * shown).unbind(1)
     counts = columns * rows
     ends = counts.cumsum(0)
@@ -105,13 +106,13 @@ def pixels(tile, wide, width, height):
 
 @kernel
 def laid(flat, gaussian, listed, x, y):
-    """Alpha of a Gaussian at some pixels before it is cut to ``MOST``, 0 where it is too small, with its parts."""
+    """Alpha of a Gaussian at some pixels before it is cut to ``MAX_ALPHA``, 0 where it is too small, with its parts."""
     row = flat + gaussian * 6
     dx, dy = x - tl.load(row), y - tl.load(row + 1)
     a, b, c = tl.load(row + 2), tl.load(row + 3), tl.load(row + 4)
     opacity = tl.load(row + 5)
     raw = opacity * tl.exp(-0.5 * (a * dx * dx + c * dy * dy) - b * dx * dy)
-    return tl.where(listed & (raw >= LEAST), raw, 0.0), dx, dy, a, b, c, opacity
+    return tl.where(listed & (raw >= MIN_ALPHA), raw, 0.0), dx, dy, a, b, c, opacity
 
 
 @kernel
@@ -126,16 +127,16 @@ def draw(
     made = tl.zeros((WIDTH, PIXELS), tl.float32)
     place, end = tl.load(starts + tile), tl.load(starts + tile + 1)
     while place < end:
-        for more in range(LOOK):
+        for more in range(GAUSSIANS_PER_TEST):
             listed = place + more < end
             gaussian = tl.load(owner + place + more, mask=listed, other=0)
             raw, _, _, _, _, _, _ = laid(flat, gaussian, listed, x, y)
-            weight = tl.minimum(raw, MOST) * through
+            weight = tl.minimum(raw, MAX_ALPHA) * through
             color = tl.load(colors + gaussian * CHANNELS + channel, mask=channel < CHANNELS, other=0.0)
             made += color[:, None] * weight[None, :]
             through -= weight
-        place += LOOK
-        end = tl.where(tl.max(through, 0) < ENOUGH, tl.minimum(place, end), end)
+        place += GAUSSIANS_PER_TEST
+        end = tl.where(tl.max(through, 0) < MIN_TRANSMITTANCE, tl.minimum(place, end), end)
     tl.store(ends + tile, end)
     tl.store(left + memory, through, mask=inside)
     shown = (channel < CHANNELS)[:, None] & inside[None, :]
@@ -164,13 +165,13 @@ def draw_back(
     for place in range(tl.load(starts + tile), tl.load(ends + tile)):
         gaussian = tl.load(owner + place)
         raw, dx, dy, a, b, c, opacity = laid(flat, gaussian, True, x, y)
-        alpha = tl.minimum(raw, MOST)
+        alpha = tl.minimum(raw, MAX_ALPHA)
         weight = alpha * through
         if tl.sum(weight, 0) > 0:
             color = tl.load(colors + gaussian * CHANNELS + channel, mask=channel < CHANNELS, other=0.0)
             value = tl.sum(wanted * color[:, None], 0)
             behind -= weight * value
-            grad = tl.where(raw < MOST, (through * value - behind / (1 - alpha)) * alpha, 0.0)
+            grad = tl.where(raw < MAX_ALPHA, (through * value - behind / (1 - alpha)) * alpha, 0.0)
             through -= weight
             d_color = tl.sum(wanted * weight[None, :], 1)
             tl.atomic_add(d_colors + gaussian * CHANNELS + channel, d_color, mask=channel < CHANNELS)

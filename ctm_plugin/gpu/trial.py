@@ -9,8 +9,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-ROUNDING = 2e-5
-"""By how much results may differ, as a share of the largest number: sums of some hundred numbers in float32."""
+TOLERANCE = 2e-5
+"""Largest difference of results, as a share of the largest number: sums of some hundred numbers in float32."""
 
 
 def tried(kernel: str, find: Callable[[], Callable], reference: Callable, device: torch.device) -> Callable:
@@ -18,14 +18,14 @@ def tried(kernel: str, find: Callable[[], Callable], reference: Callable, device
     try:
         run = find()
         with torch.autocast(device.type, enabled=False), torch.enable_grad():
-            found, expected = (_results(each, TRIALS[kernel](device)) for each in (run, reference))
-        wrong = [_apart(*pair) for pair in zip(found, expected, strict=True)]
-        if max(wrong) <= ROUNDING:
+            results, expected = (_results(each, TRIALS[kernel](device)) for each in (run, reference))
+        wrong = [_apart(*pair) for pair in zip(results, expected, strict=True)]
+        if max(wrong) <= TOLERANCE:
             return run
         why = f"its results are off by {max(wrong):.1g} of the largest"
     except Exception as error:  # whatever a compiler or a driver may say
-        told = str(error).strip().splitlines() or ["nothing more is known"]
-        why = f"it does not run ({type(error).__name__}: {told[-1]})"
+        warning = str(error).strip().splitlines() or ["nothing more is known"]
+        why = f"it does not run ({type(error).__name__}: {warning[-1]})"
     warnings.warn(f"the kernel {kernel} is not used on {device}: {why}; plain torch runs, slower", stacklevel=3)
     return reference
 
@@ -41,12 +41,12 @@ def _apart(one: Tensor, other: Tensor) -> float:
 
 def _results(run: Callable, arguments: tuple) -> list[Tensor]:
     """What it returns, its arguments afterwards, and gradients."""
-    found, given = list(_leaves([run(*arguments)])), list(_leaves(arguments))
+    results, given = list(_leaves([run(*arguments)])), list(_leaves(arguments))
     wanted = [each for each in given if each.requires_grad]
     if wanted:
-        loss = sum((each * torch.arange(each.numel(), device=each.device).view_as(each)).sum() for each in found)
-        found += torch.autograd.grad(loss, wanted)
-    return [*found, *given]
+        loss = sum((each * torch.arange(each.numel(), device=each.device).view_as(each)).sum() for each in results)
+        results += torch.autograd.grad(loss, wanted)
+    return [*results, *given]
 
 
 def _leaves(of: Any) -> Iterator[Tensor]:
@@ -101,9 +101,6 @@ TRIALS: dict[str, Callable[[torch.device], tuple]] = {
     "lookup:weighted": lambda device: (_rand(device, 210, 12), *_of_rows(device)),
     "lookup:scattered": lambda device: (*_of_rows(device), _rand(device, 150, 12), torch.Size([210, 12]), False),
     "samples:occupied_samples": _of_samples,
-    "samples:placed_samples": lambda device: (
-        *_of_samples(device), False, torch.arange(500, device=device)
-    ),
     "weights:VolumeWeights.apply": lambda device: (
         (3 * _rand(device, 400) ** 4).requires_grad_(), (torch.arange(400, device=device) / 20).sqrt().long(), 5,
     ),
@@ -111,4 +108,4 @@ TRIALS: dict[str, Callable[[torch.device], tuple]] = {
     "splats:rasterize": _of_splats,
     "hash_grid:spread": lambda device: (_rand(device, 150, 4), *_of_hashes(device), torch.Size([381, 2])),
 }  # fmt: skip
-"""Arguments of each kernel, the same each time; blocks are not full."""
+"""Makes the arguments with which each kernel is tried, the same each time; their blocks are not full."""

@@ -9,8 +9,8 @@ from torch.autograd.function import once_differentiable
 
 from ctm_plugin.gpu.kernels import kernel, launch, whole
 
-BLOCK = 64
-"""Samples that a program holds at once."""
+SAMPLE_BLOCK = 64
+"""Samples that one program of the kernel holds at once."""
 
 
 class VolumeWeights(torch.autograd.Function):
@@ -21,7 +21,7 @@ class VolumeWeights(torch.autograd.Function):
         depth, ray_index = whole(optical_depth.detach(), ray_index)
         starts = torch.searchsorted(ray_index, torch.arange(n_rays + 1, device=ray_index.device))
         weights, transmittance = torch.empty_like(depth), depth.new_empty(n_rays)
-        launch(_weights, (n_rays,), depth, starts, weights, transmittance, BLOCK=BLOCK, num_warps=1)
+        launch(_weights, (n_rays,), depth, starts, weights, transmittance, BLOCK=SAMPLE_BLOCK, num_warps=1)
         ctx.save_for_backward(depth, starts, weights)
         return weights, transmittance
 
@@ -29,9 +29,9 @@ class VolumeWeights(torch.autograd.Function):
     @once_differentiable
     def backward(ctx, of_weights: Tensor, of_transmittance: Tensor) -> tuple[Tensor, None, None]:
         depth, starts, weights = ctx.saved_tensors
-        found, given = torch.empty_like(depth), whole(of_weights, of_transmittance)
-        launch(_gradient, (len(starts) - 1,), depth, starts, weights, *given, found, BLOCK=BLOCK, num_warps=1)
-        return found, None, None
+        of_depth, given = torch.empty_like(depth), whole(of_weights, of_transmittance)
+        launch(_gradient, (len(starts) - 1,), depth, starts, weights, *given, of_depth, BLOCK=SAMPLE_BLOCK, num_warps=1)
+        return of_depth, None, None
 
 
 @kernel
@@ -64,7 +64,7 @@ def _weights(depths, starts, weights, transmittance, BLOCK: tl.constexpr):
 
 
 @kernel
-def _gradient(depths, starts, weights, of_weights, of_transmittance, found, BLOCK: tl.constexpr):
+def _gradient(depths, starts, weights, of_weights, of_transmittance, of_depth, BLOCK: tl.constexpr):
     ray, lane = tl.program_id(0), tl.arange(0, BLOCK)
     start, end = tl.load(starts + ray), tl.load(starts + ray + 1)
     # In float64, differences too: what light passes on and what lies behind are nearly the same where all is thin.
@@ -83,6 +83,6 @@ def _gradient(depths, starts, weights, of_weights, of_transmittance, found, BLOC
         change = tl.load(of_weights + m, mask=m < end, other=0.0)
         part = tl.load(weights + m, mask=m < end, other=0.0).to(tl.float64) * change
         left = tl.exp(-(passed + tl.cumsum(solid, 0)))
-        tl.store(found + m, (left * change - (behind - tl.cumsum(part, 0))).to(tl.float32), mask=m < end)
+        tl.store(of_depth + m, (left * change - (behind - tl.cumsum(part, 0))).to(tl.float32), mask=m < end)
         passed += tl.sum(solid, 0)
         behind -= tl.sum(part, 0)

@@ -8,6 +8,7 @@ from typing import Any
 from lightning.pytorch.loggers import Logger
 from torch import Tensor
 
+from ctm_plugin.metrics.table import METRICS
 from ctm_plugin.settings.setting import Nothing
 
 
@@ -27,10 +28,14 @@ class RunLogger(Logger):
             _ = self.experiment  # Lightning's make theirs when it is asked for
 
     def log_metrics(self, metrics: Mapping[str, Any], step: int | None = None) -> None:
-        """Log numbers by name, at a step; those that a module or a callback gave to ``self.log`` come here too."""
+        """Log numbers by name, at a step; those that a module or a callback gave to ``self.log`` come here too.
+
+        Scores of validations have the names of their curves.
+        """
         if "epoch" in metrics:  # Lightning's own mark on the latter, whose steps it counts from 0
             metrics, step = {name: value for name, value in metrics.items() if name != "epoch"}, step + 1
-        super().log_metrics(metrics, step)
+        curves = {f"val/{name}": metric.curve[0] for name, metric in METRICS.items() if metric.curve}
+        super().log_metrics({curves.get(name, name): value for name, value in metrics.items()}, step)
 
     def log_pictures(self, pictures: Mapping[str, Tensor], step: int) -> None:
         """Log pictures ``[H, W, 3]`` in [0, 1], by name."""

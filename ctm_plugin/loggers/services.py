@@ -36,8 +36,9 @@ CHARTS = {
     "Speed": {"milliseconds a step": r"speed/ms_per_step$", "rays a second": r"speed/rays_per_second$"},
     "Field": {"the backbone's own numbers": r"field/"},
 }
-"""TensorBoard's, of regular expressions over tags, in addition to those of metrics."""
-TRAINED = {"": r"psnr/rgb$", " in the latent space": r"psnr/latent$"}
+"""Charts that TensorBoard gets besides those of metrics, as regular expressions over tags."""
+TRAIN_CHARTS = {"": r"psnr/rgb$", " in the latent space": r"psnr/latent$"}
+"""Charts of the training's PSNR by what follows their title."""
 
 
 class CSV(RunLogger, CSVLogger):
@@ -117,7 +118,7 @@ class TensorBoard(RunLogger, TensorBoardLogger):
 def layout() -> dict[str, dict[str, list]]:
     """Lay out all charts. The same for all runs: TensorBoard merges the layouts that it finds."""
     quality = {chart: f"{tag}$" for tag, chart in (metric.curve for metric in METRICS.values() if metric.curve)}
-    quality |= {f"PSNR of the training pixels{end}": tag for end, tag in TRAINED.items()}
+    quality |= {f"PSNR of the training pixels{end}": tag for end, tag in TRAIN_CHARTS.items()}
     charts = {"Quality": quality} | CHARTS
     return {title: {chart: ["Multiline", [tag]] for chart, tag in inside.items()} for title, inside in charts.items()}
 

@@ -14,16 +14,18 @@ from torch import Tensor
 
 from ctm_plugin.metrics.image import SSIM_SIGMA, SSIM_WINDOW
 
-SQUARE, CELLS = 12, 4
-"""Pixels along a square in which noise is looked for, and cells along it, whose means tell whether it is flat."""
-LEVELS, FLATTEST = 3, 0.15
-"""Classes of brightness, as noise depends on light; the share of each class's squares that is taken for flat."""
-ROUNDING = 1e-6
-"""Smaller values of a fine band are float32's rounding of what is flat."""
-LEAST = 0.05
-"""Of the photograph's variance: where less is real, there is no score, as noise is not known so exactly."""
-SQUARES = 40
-"""A view with fewer, as one of 100x75 pixels, has too few flat ones to know its noise: any detail would be all."""
+SQUARE_SIDE, CELL_SIDE = 12, 4
+"""Pixels along a square in which noise is measured, and along its cells, whose means tell whether it is flat."""
+BRIGHTNESS_CLASSES, FLAT_SHARE = 3, 0.15
+"""Number of classes of brightness, as noise depends on light, and the share of each class's squares that counts as
+flat."""
+MIN_BAND = 1e-6
+"""Least absolute value of the fine band; smaller ones are float32's rounding of flat areas."""
+MIN_DETAIL = 0.05
+"""Least share of the photograph's fine variance that must be detail for a score: noise is not known more exactly."""
+MIN_SQUARES = 40
+"""Least number of squares of a view with a score: fewer, as at 100x75 pixels, hold too few flat ones to know its
+noise."""
 
 
 def detail_moments(
@@ -48,11 +50,11 @@ def detail_moments(
     window = torch.softmax(-0.5 * (offsets / SSIM_SIGMA) ** 2, 0)
     edge = SSIM_WINDOW // 2
     inside = pair[:, edge:-edge, edge:-edge]
-    if min(inside.shape[1:]) < SQUARE:
+    if min(inside.shape[1:]) < SQUARE_SIDE:
         return None
     blurred = F.conv2d(F.conv2d(pair[:, None], window[None, None, None]), window[None, None, :, None])[:, 0]
     band, whole = inside - blurred, torch.ones_like(inside[0], dtype=torch.bool)
-    band = band * (band.abs() > ROUNDING)
+    band = band * (band.abs() > MIN_BAND)
     if mask is not None:
         whole = F.max_pool2d((~mask)[None].float(), SSIM_WINDOW, stride=1)[0] == 0
         band = band * whole
@@ -77,21 +79,21 @@ def noise_variance(
         whole: which pixels count; squares must consist of such.
 
     Returns:
-        The mean over classes; ``None`` where fewer than :data:`SQUARES` count.
+        The mean over classes; ``None`` where fewer than :data:`MIN_SQUARES` count.
     """
-    cells = F.avg_pool2d(photograph[None], SQUARE // CELLS)
-    brightness = F.avg_pool2d(cells, CELLS)
-    contrast = F.avg_pool2d(cells.square(), CELLS) - brightness.square()
-    fine = F.avg_pool2d(band.square()[None], SQUARE)
-    counted = F.avg_pool2d(whole[None].float(), SQUARE) == 1
+    cells = F.avg_pool2d(photograph[None], SQUARE_SIDE // CELL_SIDE)
+    brightness = F.avg_pool2d(cells, CELL_SIDE)
+    contrast = F.avg_pool2d(cells.square(), CELL_SIDE) - brightness.square()
+    fine = F.avg_pool2d(band.square()[None], SQUARE_SIDE)
+    counted = F.avg_pool2d(whole[None].float(), SQUARE_SIDE) == 1
     brightness, contrast, fine = brightness[counted], contrast[counted], fine[counted]
-    if len(fine) < SQUARES:
+    if len(fine) < MIN_SQUARES:
         return None
-    found = [
-        fine[of[contrast[of].argsort()[: max(1, round(FLATTEST * len(of)))]]].median() * len(of)
-        for of in brightness.argsort().tensor_split(min(LEVELS, len(fine)))
+    medians = [
+        fine[of[contrast[of].argsort()[: max(1, round(FLAT_SHARE * len(of)))]]].median() * len(of)
+        for of in brightness.argsort().tensor_split(min(BRIGHTNESS_CLASSES, len(fine)))
     ]
-    return torch.stack(found).sum() / len(fine)
+    return torch.stack(medians).sum() / len(fine)
 
 
 def detail(moments: Sequence[Float64[Tensor, " 4"]]) -> float | None:
@@ -113,6 +115,6 @@ def detail(moments: Sequence[Float64[Tensor, " 4"]]) -> float | None:
         return None
     both, rendered, photographed, noise = torch.stack(list(moments)).sum(0).tolist()
     real = photographed - noise
-    if real <= LEAST * photographed:
+    if real <= MIN_DETAIL * photographed:
         return None
     return min(max(both, 0.0) ** 2 / (rendered * real), 1.0) if rendered > 0 else 0.0

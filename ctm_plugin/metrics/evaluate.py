@@ -126,7 +126,7 @@ def summarize(
 
 
 @torch.no_grad()
-def summarize_alignment(found: Alignment) -> dict[str, Any]:
+def summarize_alignment(alignment: Alignment) -> dict[str, Any]:
     """Score aligned patches.
 
     Returns:
@@ -134,18 +134,18 @@ def summarize_alignment(found: Alignment) -> dict[str, Any]:
         ``converged`` and ``per_patch``, a list of dicts of ``patch`` and what there is of each. Numbers that are NaN or
         infinite are ``None``.
     """
-    constant = best_constant_psnr(list(found.clean))
-    results = {name: metric.alignment(found) for name, metric in METRICS.items() if metric.alignment}
+    constant = best_constant_psnr(list(alignment.clean))
+    results = {name: metric.alignment(alignment) for name, metric in METRICS.items() if metric.alignment}
     scores = {name: float(result.mean()) for name, result in results.items()}
     of_each = {name: result.tolist() for name, result in results.items() if result.ndim}
     return {
         **{name: _number(value) for name, value in scores.items()},
         "constant_psnr": _number(constant),
-        "enhancement_gain": found.gain,
+        "enhancement_gain": alignment.gain,
         "converged": converged(scores["psnr"], constant),
         "per_patch": [
             {"patch": index} | {name: _number(values[index]) for name, values in of_each.items()}
-            for index in range(len(found.clean))
+            for index in range(len(alignment.clean))
         ],
     }
 

@@ -16,8 +16,10 @@ from torchmetrics.functional.image import structural_similarity_index_measure
 from ctm_plugin.metrics.precision import full_float32
 
 SSIM_WINDOW = 11
+"""Pixels along SSIM's Gaussian window, and its standard deviation (Wang et al. 2004)."""
 SSIM_SIGMA = 1.5
 CONVERGENCE_MARGIN_DB = 1.0
+"""PSNR in dB above a constant picture's that a converged run has at least."""
 
 
 def psnr(

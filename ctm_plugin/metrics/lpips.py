@@ -19,7 +19,8 @@ from ctm_plugin.metrics.precision import full_float32
 Net = Literal["alex", "vgg"]
 # ImageNet's statistics for inputs in [-1, 1], as rounded in the released code.
 SHIFT, SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
-POOL = {"alex": 3, "vgg": 2}
+POOL_SIZE = {"alex": 3, "vgg": 2}
+"""Pixels along the window of max pooling by network."""
 CONVOLUTIONS = {
     "alex": [(64, 11, 4, 2), "pool", (192, 5, 1, 2), "pool", (384, 3, 1, 1), (256, 3, 1, 1), (256, 3, 1, 1)],
     "vgg": [
@@ -29,10 +30,10 @@ CONVOLUTIONS = {
     ],
 }
 """Channels, kernel, stride and padding; between them pooling with stride 2."""
-COMPARED = {"alex": (1, 4, 7, 9, 11), "vgg": (3, 8, 15, 22, 29)}
-"""Layers whose outputs are compared."""
-SMALLEST = {"alex": 31, "vgg": 16}
-"""Pixels a side."""
+COMPARED_LAYERS = {"alex": (1, 4, 7, 9, 11), "vgg": (3, 8, 15, 22, 29)}
+"""Indices of the layers whose outputs are compared."""
+MIN_SIDE = {"alex": 31, "vgg": 16}
+"""Least side in pixels of a picture that the network takes."""
 
 
 def feature_network(net: Net) -> nn.Sequential:
@@ -41,7 +42,7 @@ def feature_network(net: Net) -> nn.Sequential:
     channels = 3
     for each in CONVOLUTIONS[net]:
         if each == "pool":
-            layers.append(nn.MaxPool2d(POOL[net], stride=2))
+            layers.append(nn.MaxPool2d(POOL_SIZE[net], stride=2))
         else:
             layers += [nn.Conv2d(channels, *each), nn.ReLU()]
             channels = each[0]
@@ -70,9 +71,9 @@ class LPIPS(nn.Module):
 
     def __init__(self, net: Net = "alex"):
         super().__init__()
-        self.net, self.min_size = net, SMALLEST[net]
+        self.net, self.min_size = net, MIN_SIDE[net]
         self.features = feature_network(net)
-        channels = [self.features[layer - 1].out_channels for layer in COMPARED[net]]
+        channels = [self.features[layer - 1].out_channels for layer in COMPARED_LAYERS[net]]
         self.heads = nn.ParameterList(torch.full((1, c, 1, 1), 1.0 / c) for c in channels)
         self.register_buffer("shift", torch.tensor(SHIFT).view(1, 3, 1, 1), persistent=False)
         self.register_buffer("scale", torch.tensor(SCALE).view(1, 3, 1, 1), persistent=False)
@@ -108,6 +109,6 @@ class LPIPS(nn.Module):
         compared = []
         for index, layer in enumerate(self.features):
             x = layer(x)
-            if index in COMPARED[self.net]:
+            if index in COMPARED_LAYERS[self.net]:
                 compared.append(F.normalize(x, dim=1, eps=1e-10))
         return compared

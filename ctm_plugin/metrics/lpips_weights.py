@@ -25,14 +25,17 @@ URLS = {
     "alex": "https://download.pytorch.org/models/alexnet-owt-7be5be79.pth",
     "vgg": "https://download.pytorch.org/models/vgg16-397923af.pth",
 }
+"""Addresses of the networks' weights."""
 MEGABYTES = {"alex": 233, "vgg": 528}
-"""Of these files."""
-HEADS = "functional/image/lpips_models/{}.pth"
-MISSING = (DataError, OSError, HTTPException, EOFError, UnpicklingError, KeyError, ValueError, RuntimeError)
-"""What reading and downloading such files raises, and a network that is given other weights."""
+"""Size of each of these files in megabytes."""
+HEAD_FILE = "functional/image/lpips_models/{}.pth"
+"""Path inside torchmetrics of the weights of LPIPS' linear layers."""
+LOAD_ERRORS = (DataError, OSError, HTTPException, EOFError, UnpicklingError, KeyError, ValueError, RuntimeError)
+"""Errors of reading or downloading such a file, and of a network that is given other weights."""
 TIMEOUT_S = 4.0
-MOST = 2**30
-"""Bytes that a file of weights may hold, unpacked: VGG-16 has half as many."""
+"""Seconds without an answer after which a download is given up."""
+MAX_BYTES = 2**30
+"""Most bytes of a file of weights, unpacked: VGG-16 has half as many."""
 
 
 def load_lpips(path: str | Path | None = None, net: Net = "alex") -> tuple[LPIPS | None, str]:
@@ -51,7 +54,7 @@ def load_lpips(path: str | Path | None = None, net: Net = "alex") -> tuple[LPIPS
             heads, its own file of which is named.
     """
     model = LPIPS(net)
-    source, what = Path(torchmetrics.__file__).parent / HEADS.format(net), "heads, which torchmetrics has"
+    source, what = Path(torchmetrics.__file__).parent / HEAD_FILE.format(net), "heads, which torchmetrics has"
     try:
         heads = torch.load(source, map_location="cpu", weights_only=True)
         for layer, parameter in enumerate(model.heads):
@@ -63,14 +66,14 @@ def load_lpips(path: str | Path | None = None, net: Net = "alex") -> tuple[LPIPS
         )
         if not all(bool(value.isfinite().all()) for value in model.features.parameters()):
             raise ValueError("NaN or infinite weights")
-    except MISSING as error:
-        told = f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"
+    except LOAD_ERRORS as error:
+        warning = f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"
         if path is None:
             advice = "; set metrics.lpips_weights to a file" if source == URLS[net] else ""
-            return None, f"no weights for LPIPS ({net}): {source}: {told}{advice}"
+            return None, f"no weights for LPIPS ({net}): {source}: {warning}{advice}"
         if isinstance(error, DataError):
             raise
-        raise DataError(source, f"no such weights ({told})", f"the weights of LPIPS' {what}") from error
+        raise DataError(source, f"no such weights ({warning})", f"the weights of LPIPS' {what}") from error
     return model.eval(), ""
 
 
@@ -84,7 +87,7 @@ def read_weights(path: Path) -> Mapping[str, Tensor]:
         raise DataError(path, found="no file", expected="weights of LPIPS' network (.npz or .pth)")
     try:
         if zipfile.is_zipfile(path):
-            check_zip(path, MOST)
+            check_zip(path, MAX_BYTES)
         if path.suffix == ".npz":
             with np.load(path, allow_pickle=False) as arrays:
                 return {name: torch.from_numpy(arrays[name]) for name in arrays.files}

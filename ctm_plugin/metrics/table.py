@@ -24,7 +24,7 @@ from ctm_plugin.rays.homography import patch_corners, sl3_exp, to_pixels, warp
 from ctm_plugin.settings.registry import METRICS_OF_OTHERS
 
 PLACES = ("run", "sweep", "report", "demo")
-"""Where people read scores: the table of one run, the line of a run among others, reports, the demo's comparison."""
+"""Where people read scores: the table of one run, its line in a sweep, reports, the demo's comparison."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,11 +88,11 @@ class Metric:
         return f"{number} {self.unit}" if self.unit else number
 
 
-def corner_errors(found: Alignment) -> Float[Tensor, " n"]:
+def corner_errors(alignment: Alignment) -> Float[Tensor, " n"]:
     """Mean distance of each patch's four corners from where they belong, in pixels of the picture."""
-    height, width = found.picture.shape[:2]
-    corners = patch_corners(height, width, found.clean.shape[1]).to(found.warps)
-    at, belongs = (to_pixels(warp(corners, sl3_exp(h)), height, width) for h in (found.warps, found.true_warps))
+    height, width = alignment.picture.shape[:2]
+    corners = patch_corners(height, width, alignment.clean.shape[1]).to(alignment.warps)
+    at, belongs = (to_pixels(warp(corners, sl3_exp(h)), height, width) for h in (alignment.warps, alignment.true_warps))
     return (at - belongs).norm(dim=-1).mean(-1)
 
 
@@ -248,5 +248,5 @@ def add_others() -> None:
 def told_at(place: str) -> dict[str, Metric]:
     """Find the metrics that one of :data:`PLACES` shows, in the order in which it shows them."""
     add_others()
-    found = [(name, metric) for name, metric in METRICS.items() if place in metric.told]
-    return dict(sorted(found, key=lambda item: item[1].order))
+    metrics = [(name, metric) for name, metric in METRICS.items() if place in metric.told]
+    return dict(sorted(metrics, key=lambda item: item[1].order))

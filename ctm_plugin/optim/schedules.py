@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 
 Schedule = Callable[[int | float], float]
-"""Factor on a learning rate after so many optimizer steps, parts of steps where time stretches or cuts a schedule."""
+"""Factor on a learning rate after a number of optimizer steps; the number has parts where time stretches or cuts a
+schedule."""
 
 
 def exponential(factor: float, steps: int, start: int = 0) -> Schedule:

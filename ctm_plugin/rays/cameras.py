@@ -34,7 +34,7 @@ class Rays(NamedTuple):
 
 
 NEWTON_STEPS = 8
-"""Steps of :func:`undistort`. Four do for a wide-angle lens, six for a barrel close to where it folds."""
+"""Newton steps of :func:`undistort`. A wide-angle lens needs four, a barrel close to where it folds six."""
 
 
 def distort(x: Tensor, y: Tensor, distortion: Float[Tensor, "*r 5"]) -> tuple[Tensor, Tensor]:

@@ -6,12 +6,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-RADIUS = 2.0
-"""Of the ball that holds all of space."""
-STRAIGHT = 2.0
-"""So far a ray is paced evenly: one that begins in the unit ball has left it by then."""
-INFINITY = 2 * STRAIGHT
-"""The pace at which a ray ends."""
+BALL_RADIUS = 2.0
+"""Radius of the ball that all of space is contracted into."""
+UNIFORM_DISTANCE = 2.0
+"""Distance up to which samples are evenly spaced: a ray that begins in the unit ball has left it by then."""
+END_PACE = 2 * UNIFORM_DISTANCE
+"""Pace of a point at infinity."""
 
 
 def distance(points: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n"]:
@@ -33,12 +33,12 @@ def travelled(pace: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
     Args:
         pace: in [0, 2 B).
     """
-    return torch.where(pace <= STRAIGHT, pace, STRAIGHT**2 / (INFINITY - pace))
+    return torch.where(pace <= UNIFORM_DISTANCE, pace, UNIFORM_DISTANCE**2 / (END_PACE - pace))
 
 
 def paced(distance: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
     """Undo :func:`travelled`: ``d`` up to B = 2, then ``2 B - B^2 / d``."""
-    return torch.where(distance <= STRAIGHT, distance, INFINITY - STRAIGHT**2 / distance)
+    return torch.where(distance <= UNIFORM_DISTANCE, distance, END_PACE - UNIFORM_DISTANCE**2 / distance)
 
 
 def lengths(pace: Float[Tensor, " n"], points: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
@@ -51,5 +51,5 @@ def lengths(pace: Float[Tensor, " n"], points: Float[Tensor, "n 3"]) -> Float[Te
         pace: where they lie along their rays.
         points: contracted.
     """
-    along = (travelled(pace) / STRAIGHT).clamp_min(1.0)
+    along = (travelled(pace) / UNIFORM_DISTANCE).clamp_min(1.0)
     return (along * (2 - distance(points)).clamp_max(1.0)).square()

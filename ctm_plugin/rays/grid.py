@@ -42,7 +42,7 @@ class VoxelGrid(nn.Module):
         last = torch.tensor(shape, dtype=torch.float32) - 1
         offsets = [(i * ny + j) * nz + k for i in (0, 1) for j in (0, 1) for k in (0, 1)]
         for name, value in {
-            "box": box.float(),
+            "aabb": box.float(),
             "last": last,
             "scale": last / (box[1] - box[0]).float(),
             "offsets": torch.tensor(offsets, dtype=torch.int32),
@@ -55,20 +55,20 @@ class VoxelGrid(nn.Module):
 
     def corners(self, points: Float[Tensor, "m 3"]) -> Corners:
         """Find vertices and weights for trilinear interpolation; points outside are taken to the nearest face."""
-        return Corners(*corners(points, self.box[0], self.scale, self.last, self.offsets))
+        return Corners(*corners(points, self.aabb[0], self.scale, self.last, self.offsets))
 
     def nearest(self, points: Float[Tensor, "m 3"]) -> Int[Tensor, " m"]:
         """Find the row of the vertex nearest to each point; points outside are taken to the nearest face."""
-        return nearest_rows(points, self.box[0], self.scale, self.last, self.offsets)
+        return nearest_rows(points, self.aabb[0], self.scale, self.last, self.offsets)
 
     def nearest_index(self, points: Float[Tensor, "m 3"]) -> Int[Tensor, "m 3"]:
         """Find the vertex nearest to each point by its index along each side."""
-        return _position(points, self.box[0], self.scale, self.last).round_().int()
+        return _position(points, self.aabb[0], self.scale, self.last).round_().int()
 
     def axes(self) -> list[Tensor]:
         """List the vertices' coordinates along each side, ``[X]``, ``[Y]``, ``[Z]``."""
-        sides = zip(*self.box.tolist(), self.shape, strict=True)
-        return [torch.linspace(a, b, n, device=self.box.device) for a, b, n in sides]
+        sides = zip(*self.aabb.tolist(), self.shape, strict=True)
+        return [torch.linspace(a, b, n, device=self.aabb.device) for a, b, n in sides]
 
     def vertices(self) -> Float[Tensor, "v 3"]:
         """List the positions of all vertices, in the table's order."""
@@ -89,7 +89,7 @@ class VoxelGrid(nn.Module):
             ends.append([torch.where(some, axis, torch.inf).amin(), torch.where(some, axis, -torch.inf).amax()])
         low, high = torch.stack([torch.stack(each) for each in ends], dim=1)
         half = 0.5 / self.scale
-        return torch.stack([low - half, high + half]).clamp(*self.box)
+        return torch.stack([low - half, high + half]).clamp(*self.aabb)
 
 
 def _position(points: Tensor, low: Tensor, scale: Tensor, last: Tensor) -> Tensor:

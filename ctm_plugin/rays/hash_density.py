@@ -14,8 +14,8 @@ from ctm_plugin.door import looped
 from ctm_plugin.rays.hash_grid import encoded
 from ctm_plugin.rays.volume import volume_weights
 
-DENSEST = 15.0
-"""Largest logarithm of a density: a thousandth of a side stops all light."""
+MAX_LOG_DENSITY = 15.0
+"""Largest logarithm of a density: a thousandth of a side then stops all light."""
 
 
 @looped("hash_density:log_density", when=lambda table, *_: table.shape[1] == 2)
@@ -53,23 +53,13 @@ def lit(
     Returns:
         Their indices ``[N]``, ascending, and features ``[N, L F]``.
     """
-    features, mask = reach(table, sides, starts, first, last, points, lengths, ray_index, n_rays, threshold)
-    kept = mask.nonzero().squeeze(1)
-    return kept, features.index_select(0, kept)
-
-
-@torch.no_grad()
-def reach(
-    table: Tensor, sides: Tensor, starts: Tensor, first: nn.Linear, last: nn.Linear, points: Tensor,
-    lengths: Tensor, ray_index: Tensor, n_rays: int, threshold: float,
-) -> tuple[Tensor, Tensor]:  # fmt: skip
-    """Tell of all samples what :func:`lit` does: features ``[M, L F]``, and whether it keeps them, ``[M]``."""
     features = encoded(table, points, sides, starts)
     raw = _first(features, first, last)
-    optical_depth = raw.clamp_max(DENSEST).exp() * lengths
+    optical_depth = raw.clamp_max(MAX_LOG_DENSITY).exp() * lengths
     weights, _ = volume_weights(optical_depth, ray_index, n_rays)
     alpha = -torch.expm1(-optical_depth)
-    return features, (alpha > threshold) & (weights > threshold * alpha)
+    kept = ((alpha > threshold) & (weights > threshold * alpha)).nonzero().squeeze(1)
+    return kept, features.index_select(0, kept)
 
 
 def _first(features: Tensor, first: nn.Linear, last: nn.Linear) -> Tensor:

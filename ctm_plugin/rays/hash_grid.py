@@ -17,9 +17,9 @@ from torch.autograd.function import once_differentiable
 from ctm_plugin.door import looped
 
 PRIMES = (1, 2654435761, 805459861)
-"""A large number for each axis."""
-BLOCK = 1 << 16
-"""Points whose corners the plain version has at once: about half a gigabyte of them with 16 levels."""
+"""Primes of the spatial hash, one for each axis (Teschner et al. 2003)."""
+POINT_BLOCK = 1 << 16
+"""Points that plain torch looks up at once: their corners take about half a gigabyte with 16 levels."""
 
 
 def resolutions(levels: int, coarsest: int, finest: int) -> list[int]:
@@ -95,9 +95,9 @@ def hashed_corners(
     rows, across = starts.diff(), sides + 1
     own = along(0, ends) + (along(1, ends) + along(2, ends) * across[:, None, None, None]) * across[:, None, None, None]
     hashed = along(0, ends) ^ along(1, ends * PRIMES[1]) ^ along(2, ends * PRIMES[2])
-    found = torch.where((across**3 <= rows)[:, None], own.flatten(2), hashed.flatten(2) & (rows[:, None] - 1))
+    rows_at = torch.where((across**3 <= rows)[:, None], own.flatten(2), hashed.flatten(2) & (rows[:, None] - 1))
     weights = along(0, shares) * along(1, shares) * along(2, shares)
-    return found + starts[:-1, None], weights.flatten(2)
+    return rows_at + starts[:-1, None], weights.flatten(2)
 
 
 # The paper's two numbers a vertex, which a loop holds in registers.
@@ -112,7 +112,7 @@ def encoded(table: Tensor, points: Tensor, sides: Tensor, starts: Tensor) -> Ten
         starts: ``[L + 1]``, where each level's rows begin, and end.
     """
     parts = []
-    for block in points.split(BLOCK):
+    for block in points.split(POINT_BLOCK):
         rows, weights = hashed_corners(block, sides, starts)
         values = table.index_select(0, rows.flatten()).view(*rows.shape, table.shape[1])
         parts.append((values * weights[..., None]).sum(2).flatten(1))
@@ -132,9 +132,9 @@ def spread(grad: Tensor, points: Tensor, sides: Tensor, starts: Tensor, shape: t
         points, sides, starts: as there.
         shape: (V, F).
     """
-    found = grad.new_zeros(shape)
-    for block, each in zip(points.split(BLOCK), grad.split(BLOCK), strict=True):
+    table_grad = grad.new_zeros(shape)
+    for block, each in zip(points.split(POINT_BLOCK), grad.split(POINT_BLOCK), strict=True):
         rows, weights = hashed_corners(block, sides, starts)
         parts = each.view(*rows.shape[:2], 1, shape[1]) * weights[..., None]
-        found.index_add_(0, rows.flatten(), parts.flatten(0, 2))
-    return found
+        table_grad.index_add_(0, rows.flatten(), parts.flatten(0, 2))
+    return table_grad

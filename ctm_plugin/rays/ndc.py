@@ -10,12 +10,12 @@ from torch import Tensor
 
 from ctm_plugin.rays.cameras import Rays
 
-STEEPEST = 0.05
+MIN_FORWARD = 0.05
 """Least part of a ray's direction along -z: nearly 3 degrees off the image plane, where coordinates blow up."""
 
 
 class NDC(NamedTuple):
-    """Of a camera at the origin, x right, y up, looking along -z (Mildenhall et al., ECCV 2020, appendix C).
+    """Normalised device coordinates (Mildenhall et al., ECCV 2020, appendix C) of a camera that looks along -z, y up.
 
     A point (x, y, z) with depth -z in [near, inf) has the coordinates
     ``(-scale_x x / z, -scale_y y / z, 1 + 2 near / z)``: z runs from -1 at the near plane to 1 at infinity, x and y

@@ -44,28 +44,6 @@ def occupied_samples(
     return t.index_select(0, keep), ray_index.index_select(0, keep), points.T.index_select(1, keep).T
 
 
-@looped(kernel="samples:placed_samples")
-def placed_samples(
-    origins: Tensor, directions: Tensor, first: Tensor, counts: Tensor, step: float, occupancy: Tensor,
-    low: Tensor, scale: Tensor, last: Tensor, offsets: Tensor, contracted: bool, spare: Tensor,
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
-    """Do as :func:`occupied_samples`, into a fixed number of places N; the kernel waits for nothing.
-
-    Args:
-        origins, directions, first, counts, step, occupancy, low, scale, last, offsets, contracted: as there.
-        spare: ``[N]``, on which rays places lie that are left over, at distance 0 in the middle of space.
-
-    Returns:
-        Distances ``[N]``, rays ``[N]``, points ``[N, 3]``; and ``[]``, how many there are, also without a place.
-    """
-    found = occupied_samples(origins, directions, first, counts, step, occupancy, low, scale, last, offsets, contracted)
-    total, places = len(found[0]), len(spare)
-    t, ray_index, points = (each[:places] for each in found)
-    t, ray_index = torch.cat([t, t.new_zeros(places - len(t))]), torch.cat([ray_index, spare[len(ray_index) :]])
-    points = torch.cat([points.T, points.new_zeros(3, places - len(points))], dim=1).T
-    return t, ray_index, points, torch.tensor(total, device=first.device)
-
-
 def dilate(volume: Float[Tensor, "x y z"]) -> Float[Tensor, "x y z"]:
     """Take the maximum over each vertex and its 26 neighbours."""
     return F.max_pool3d(volume[None], kernel_size=3, stride=1, padding=1)[0]

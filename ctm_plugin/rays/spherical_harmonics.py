@@ -38,8 +38,8 @@ def harmonics(directions: Float[Tensor, "n 3"], degrees: int) -> Float[Tensor, "
     normed = {key: _norm(*key) * values for key, values in legendre.items()}
     orders = [(degree, order) for degree in range(degrees) for order in range(-degree, degree + 1)]
     # Few operators, each of many numbers: a GPU takes as long for one as for a million.
-    turns = torch.stack([real[order] if order >= 0 else imaginary[-order] for _, order in orders], dim=-1)
-    return turns * torch.stack([normed[degree, abs(order)] for degree, order in orders], dim=-1)
+    azimuthal = torch.stack([real[order] if order >= 0 else imaginary[-order] for _, order in orders], dim=-1)
+    return azimuthal * torch.stack([normed[degree, abs(order)] for degree, order in orders], dim=-1)
 
 
 @cache

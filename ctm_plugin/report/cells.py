@@ -14,8 +14,9 @@ from ctm_plugin.metrics.table import METRICS
 from ctm_plugin.report.runs import Run
 
 CONFIDENCE = 0.95
+"""Level of the confidence intervals."""
 Rows = Sequence[tuple[str, list[Run]]]
-"""Labels, and the runs of each."""
+"""Labels of rows with the runs of each."""
 
 
 @dataclass(frozen=True)
@@ -26,14 +27,14 @@ class Column:
     metric: str
     scene: str | None = None
     net: str | None = None
-    """LPIPS' network, where runs have several: what another one says is another measure."""
+    """LPIPS' network, where runs have several: their scores are different measures."""
 
     def score(self, run: Run) -> float | None:
         return run.value(self.metric) if self.net in (None, run.metrics.get("lpips_net")) else None
 
 
 class Difference(NamedTuple):
-    """Of a row's runs and another's of the same scene and seed."""
+    """Difference of a row's runs from another's of the same scene and seed."""
 
     against: str
     """The other row's label."""
@@ -42,7 +43,7 @@ class Difference(NamedTuple):
     """Half the width of the 95 % confidence interval (Student's t, all pairs alike); of two or more pairs."""
     pairs: int
     better: bool | None
-    """Where the interval leaves 0 out."""
+    """Whether the difference is an improvement, where the interval excludes 0."""
 
 
 @dataclass
@@ -50,20 +51,20 @@ class Cell:
     """One setting's score."""
 
     mean: float | None = None
-    """Over scenes of the means over seeds, of all runs, converged or not; ``None``: none has it, or none converged."""
+    """Mean over scenes of the means over seeds, converged or not; ``None``: no run has it, or none converged."""
     std: float | None = None
-    """Over seeds of the mean over scenes, of two or more seeds."""
+    """Standard deviation over seeds of the mean over scenes, for two or more seeds."""
     seeds: int = 0
-    """How many all scenes have."""
+    """Number of seeds that all scenes have."""
     scenes: int = 0
     expected: int = 1
-    """How many scenes there are."""
+    """Number of scenes."""
     not_converged: int = 0
     runs: int = 0
     paper: float | None = None
     """The paper's value, or another that was published; ``math.nan``: N.C. there."""
     rank: int = 0
-    """1 for the best of a column, 2 for the second best."""
+    """Rank in the column: 1 for the best, 2 for the second best."""
     differences: list[Difference] = field(default_factory=list)
 
     @property
@@ -78,7 +79,7 @@ class Table:
     title: str
     columns: list[Column]
     data: str = ""
-    """What the paper's values were measured on; empty: there are none, and published ones have rows of their own."""
+    """Data that the paper's values were measured on; empty: there are none, or they have rows of their own."""
     rows: list[tuple[str, list[Cell]]] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
 
@@ -104,28 +105,28 @@ class Table:
             for cell in whole if len(values) > 1 else ():
                 cell.rank = (1 + values.index(cell.mean)) * (cell.mean in values[:2])
             for cell, (_, runs) in zip(cells, rows, strict=True):
-                for label, those in references(runs, column):
-                    cell.differences += difference(label, column, runs, those)
+                for label, members in references(runs, column):
+                    cell.differences += difference(label, column, runs, members)
         self.rows += [(before + label, cells) for (label, _), cells in zip(rows, grid, strict=True)]
 
 
 def columns_of(metrics: Iterable[str], runs: Sequence[Run], nets: Iterable[str] = ()) -> list[Column]:
     """A column for each metric; one for each network of LPIPS where runs have several, or in addition to ``nets``."""
-    found = sorted({run.metrics["lpips_net"] for run in runs if run.metrics.get("lpips_net")} | set(nets))
+    networks = sorted({run.metrics["lpips_net"] for run in runs if run.metrics.get("lpips_net")} | set(nets))
     return [
         Column(f"{METRICS[metric].label} ({net})" if net else METRICS[metric].label, metric, net=net)
         for metric in metrics
-        for net in (found if len(found) > 1 and metric.startswith("lpips") else [None])
+        for net in (networks if len(networks) > 1 and metric.startswith("lpips") else [None])
     ]
 
 
 def cell_of(runs: Sequence[Run], column: Column, expected: int = 1) -> Cell:
     """A row's scores in a column, of ``expected`` scenes."""
-    these = [run for run in runs if column.scene in (None, run.scene)]
+    members = [run for run in runs if column.scene in (None, run.scene)]
     # The clock's and the photographs' own are sound in any case.
     sound = column.metric.endswith("_photo") or (column.metric in METRICS and not METRICS[column.metric].of)
     scored: dict[str, dict[int, float]] = {}
-    for run in these if sound or any(run.converged for run in these) else ():
+    for run in members if sound or any(run.converged for run in members) else ():
         if (value := column.score(run)) is not None:
             scored.setdefault(run.scene, {})[run.seed] = value
     common = sorted(set.intersection(*map(set, scored.values()))) if scored else []
@@ -136,8 +137,8 @@ def cell_of(runs: Sequence[Run], column: Column, expected: int = 1) -> Cell:
         seeds=len(common),
         scenes=len(scored),
         expected=expected,
-        not_converged=0 if sound else sum(not run.converged for run in these),
-        runs=len(these),
+        not_converged=0 if sound else sum(not run.converged for run in members),
+        runs=len(members),
     )
 
 

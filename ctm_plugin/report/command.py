@@ -7,9 +7,7 @@ from pathlib import Path
 
 from ctm_plugin.errors import CTMError
 from ctm_plugin.files import replacing
-from ctm_plugin.report.evidence import evidence
-from ctm_plugin.report.labels import Found, find_runs
-from ctm_plugin.report.runs import read_runs
+from ctm_plugin.report.labels import find_runs
 from ctm_plugin.report.settings import ReportConfig
 from ctm_plugin.report.tables import choose
 from ctm_plugin.report.text import FORMATS
@@ -24,26 +22,24 @@ def report(*runs: Path, settings: ReportConfig) -> None:
         CTMError: there are none with scores, or what is asked for cannot be made of them.
     """
     asked, out = settings.format, settings.out and Path(settings.out)
-    found = Found(*read_runs(runs), []) if asked == "evidence" else find_runs(runs)
-    for why in found.left_out:
+    group = find_runs(runs)
+    for why in group.left_out:
         print(f"left out: {why}", file=sys.stderr)
-    if not found.runs:
-        raise CTMError(f"{runs[0]}: found {len(found.left_out)} runs, none of them finished and whole, expected scores")
-    if asked == "evidence":
-        text = evidence(found.runs, out)
-    elif settings.figure:
+    if not group.runs:
+        raise CTMError(f"{runs[0]}: found {len(group.left_out)} runs, none of them finished and whole, expected scores")
+    if settings.figure:
         from ctm_plugin.report.figures import draw
 
-        for path in draw(settings.figure, found.runs, out or Path(f"figure_{settings.figure}")):
+        for path in draw(settings.figure, group.runs, out or Path(f"figure_{settings.figure}")):
             print(f"written to {path}")
         return
     elif asked == "html":
         from ctm_plugin.report.page import page
 
         out = out or Path("report.html")
-        text = page(choose(found, settings.table, settings.data), found, out.parent)
+        text = page(choose(group, settings.table, settings.data), group, out.parent)
     else:
-        text = FORMATS[asked](choose(found, settings.table, settings.data))
+        text = FORMATS[asked](choose(group, settings.table, settings.data))
     if out is None:
         sys.stdout.write(text)
         return

@@ -21,15 +21,15 @@ from ctm_plugin.runs.load import load_run
 from ctm_plugin.scene.views import composite, unit
 
 Picture = np.ndarray
-WIDTH, TALLEST = 1.8, 4
-"""Width of a picture in inches; height of a row of pictures in widths of one, at most: a figure's size follows."""
-PATCH = 100
-"""Side of appendix C's patch, in pixels; an eighth of a picture that is smaller than eight patches."""
-CROP = "crop"
-"""Of the pictures above, where the first and the last differ most."""
+INCHES, MAX_ASPECT = 1.8, 4
+"""Width of a picture in inches, and largest height of a row in such widths; a figure's size follows."""
+PATCH_SIDE = 100
+"""Side in pixels of appendix C's patch; an eighth of a picture that is smaller than eight patches."""
+CROP_COLUMN = "crop"
+"""Label of a crop of the pictures above it, where the first and the last differ most."""
 
 
-class Compared(NamedTuple):
+class PictureGrid(NamedTuple):
     """A figure of pictures of several kinds, a row each, of some runs side by side."""
 
     columns: Callable[[Sequence[Run]], Mapping[str, Run]]
@@ -53,19 +53,19 @@ def draw(name: str, runs: Sequence[Run], path: Path) -> list[Path]:
 
 
 def compared(name: str, runs: Sequence[Run]) -> Figure:
-    """Draw one of :data:`COMPARED`."""
-    wanted = COMPARED[name]
+    """Draw one of :data:`FIGURES`."""
+    wanted = FIGURES[name]
     columns, kinds = wanted.columns(runs), wanted.kinds
     if len(columns) < 2:
         raise _missing(name, wanted.expected)
-    rows = [[picture(run, kind) for run in columns.values()] for kind in kinds if kind != CROP]
-    if CROP in kinds:
+    rows = [[picture(run, kind) for run in columns.values()] for kind in kinds if kind != CROP_COLUMN]
+    if CROP_COLUMN in kinds:
         if len(sizes := {each.shape[:2] for each in rows[0]}) > 1:
             raise CTMError(f"found pictures of sizes {sorted(sizes)}, expected one")
         window = where_they_differ(rows[0][0], rows[0][-1])
         rows.append([each[window] for each in rows[0]])
     figure = _grid(rows, list(columns), kinds if len(kinds) > 1 else [""])
-    for axes in figure.axes[: len(columns)] if CROP in kinds else ():
+    for axes in figure.axes[: len(columns)] if CROP_COLUMN in kinds else ():
         axes.add_patch(_frame(window))
     return figure
 
@@ -92,16 +92,16 @@ def spaces(runs: Sequence[Run]) -> Mapping[str, Run]:
 
 def alignments(runs: Sequence[Run]) -> Mapping[str, Run]:
     """Alignments without CTM and with it, for each encoding."""
-    found = [run for pair in pairs(runs) if "fused" in pictures(pair[0]) for run in pair]
-    several = len({run.scene for run in found}) > 1
-    names = (f"{run.setting['backbone.encoding']}{'' if run.setting['ctm'] == 'off' else ' w/ CTM'}" for run in found)
-    return {f"{run.scene}\n{name}" if several else name: run for name, run in zip(names, found, strict=True)}
+    members = [run for pair in pairs(runs) if "fused" in pictures(pair[0]) for run in pair]
+    several = len({run.scene for run in members}) > 1
+    names = (f"{run.setting['backbone.encoding']}{'' if run.setting['ctm'] == 'off' else ' w/ CTM'}" for run in members)
+    return {f"{run.scene}\n{name}" if several else name: run for name, run in zip(names, members, strict=True)}
 
 
 def channels(runs: Sequence[Run]) -> Mapping[str, Run]:
     """CTM with several numbers of latent channels, few first."""
-    found = [run for run in _first_scene(runs) if "ctm.k" in run.setting and fits(run.setting | {"ctm.k": "3"}, {})]
-    return {f"k = {run.setting['ctm.k']}": run for run in sorted(found, key=lambda run: int(run.setting["ctm.k"]))}
+    members = [run for run in _first_scene(runs) if "ctm.k" in run.setting and fits(run.setting | {"ctm.k": "3"}, {})]
+    return {f"k = {run.setting['ctm.k']}": run for run in sorted(members, key=lambda run: int(run.setting["ctm.k"]))}
 
 
 def _first_scene(runs: Sequence[Run]) -> list[Run]:
@@ -110,17 +110,18 @@ def _first_scene(runs: Sequence[Run]) -> list[Run]:
     return [run for run, kind in seen if kind == seen[0][1]]
 
 
-WITHOUT = "a run without the term {} and one with all, as of experiment=table4"
-COMPARED = {
-    "3": Compared(partial(without, "img"), ("latent",), WITHOUT.format("img")),
-    "5": Compared(spaces, ("lit", CROP), "runs of two colour spaces with views, as of experiment=table2"),
-    "6": Compared(alignments, ("warps", "fused"), "runs of backbone=barf2d without CTM and with it"),
-    "7": Compared(partial(without, "rand"), ("lit", CROP), WITHOUT.format("rand")),
-    "8": Compared(
+WITHOUT_TERM = "a run without the term {} and one with all, as of experiment=table4"
+"""What a figure about a loss term needs."""
+FIGURES = {
+    "3": PictureGrid(partial(without, "img"), ("latent",), WITHOUT_TERM.format("img")),
+    "5": PictureGrid(spaces, ("lit", CROP_COLUMN), "runs of two colour spaces with views, as of experiment=table2"),
+    "6": PictureGrid(alignments, ("warps", "fused"), "runs of backbone=barf2d without CTM and with it"),
+    "7": PictureGrid(partial(without, "rand"), ("lit", CROP_COLUMN), WITHOUT_TERM.format("rand")),
+    "8": PictureGrid(
         channels, ("lit", "depth"), "runs with views of two numbers of latent channels, as of experiment=table5"
     ),
 }
-"""Figures by their number."""
+"""Figures of the paper by their number."""
 
 
 def renders(runs: Sequence[Run]) -> Figure:
@@ -174,7 +175,7 @@ def variance_table(run: Run) -> tuple[Picture, Picture, tuple[slice, slice], dic
         encoded = module.transform.encode(shown.to(module.device)).float().cpu()
     before, after = (255.0 * each.double().numpy() for each in (shown, encoded))
     height, width = before.shape[:2]
-    side = max(1, min(PATCH, height // 8, width // 8))
+    side = max(1, min(PATCH_SIDE, height // 8, width // 8))
     corners = np.mgrid[: height - side + 1 : max(1, side // 4), : width - side + 1 : max(1, side // 4)]
     windows = [(slice(top, top + side), slice(left, left + side)) for top, left in corners.reshape(2, -1).T]
     filled = [window for window in windows if opaque[window].all()]
@@ -201,8 +202,8 @@ def _frame(window: tuple[slice, slice]) -> Rectangle:
 
 def _grid(rows: Sequence[Sequence[Picture]], columns: Sequence[str], titles: Sequence[str]) -> Figure:
     """Pictures in rows and columns with their names."""
-    heights = [min(TALLEST, max(each.shape[0] / each.shape[1] for each in row)) for row in rows]
-    figure = Figure(figsize=(WIDTH * len(columns) + 0.5, WIDTH * sum(heights) + 0.5), layout="constrained")
+    heights = [min(MAX_ASPECT, max(each.shape[0] / each.shape[1] for each in row)) for row in rows]
+    figure = Figure(figsize=(INCHES * len(columns) + 0.5, INCHES * sum(heights) + 0.5), layout="constrained")
     axes = figure.subplots(len(rows), len(columns), squeeze=False, height_ratios=heights)
     for cell, shown in zip(axes.flat, (each for row in rows for each in row), strict=True):
         cell.imshow(shown, interpolation="nearest")

@@ -11,17 +11,17 @@ from typing import Any, NamedTuple
 from ctm_plugin.report.runs import Run, Setting, read_runs, weights
 from ctm_plugin.runs.rundir import METRICS
 
-MOST_KEYS = 6
-"""More keys than that name a row only as far as they tell runs apart: two versions differ in dozens."""
+MAX_KEYS = 6
+"""Most keys that all name a row; of more, only those that tell runs apart do: two versions differ in dozens."""
 BACKGROUNDS, BUDGET, GEOMETRY = "dataset.background_level", "trainer.budget", "dataset.geometry"
-CHOICES = (BUDGET, GEOMETRY)
-"""Keys from which others follow, such as sizes: what follows is not named with them."""
-EVERYWHERE = (*CHOICES, "dataset.near", "dataset.far", "loss.weight", "metrics.lpips_net")
-"""What all runs may share, whatever their backbone; of the data: what changes no test picture."""
-BASE = {"color_space": "rgb", "loss": None, "appearance": "none"}
-"""Values that are not said."""
-OWN = ("backbone", "ctm", *BASE, "backbone.encoding", "ctm.P", "ctm.k")
-"""What the paper's tables vary, besides weights of 0."""
+CAUSE_KEYS = (BUDGET, GEOMETRY)
+"""Keys that others, such as sizes, follow from: what follows does not name a row."""
+SHARED_KEYS = (*CAUSE_KEYS, "dataset.near", "dataset.far", "loss.weight", "metrics.lpips_net")
+"""Keys that runs of all backbones may share; of the data's keys, those that change no test picture."""
+UNNAMED_VALUES = {"color_space": "rgb", "loss": None, "appearance": "none"}
+"""Values by key that do not name a row."""
+PAPER_KEYS = ("backbone", "ctm", *UNNAMED_VALUES, "backbone.encoding", "ctm.P", "ctm.k")
+"""Keys that the paper's tables vary, besides weights of 0."""
 
 
 class Found(NamedTuple):
@@ -31,7 +31,7 @@ class Found(NamedTuple):
     left_out: list[str]
     """Folders of other runs, each with the reason: no scores yet, the error that a sweep saw, damaged, doubled."""
     shared: list[str]
-    """What all runs of a backbone on a scene share, and those on others do not."""
+    """Settings that all runs of a backbone on a scene share, and those on other scenes do not."""
 
 
 def find_runs(folders: Sequence[Path]) -> Found:
@@ -60,22 +60,22 @@ def scenes_apart(runs: Sequence[Run]) -> list[Run]:
     By the data's settings that differ, such as ``lego (dataset.exposure=0.02)``; where none does, by the protocol or
     the pictures' fingerprint. Random backgrounds are in the fingerprint, and patches differ from seed to seed.
     """
-    said: dict[int, list[str]] = {id(run): [] for run in runs}
+    note: dict[int, list[str]] = {id(run): [] for run in runs}
 
     def tell_apart(runs: Sequence[Run], keys: Sequence[str], seen: Callable[[Run], str | None], before: str) -> None:
         for alike in grouped(runs, lambda run: tuple(map(run.rest.get, keys))).values():
             if len({seen(run) for run in alike} - {None}) > 1:
                 for run in alike:
-                    said[id(run)].append(f"{before}{seen(run)}")
+                    note[id(run)].append(f"{before}{seen(run)}")
 
-    for those in grouped(runs, lambda run: run.scene).values():
-        data = [key for run in those for key in run.rest if key.startswith("dataset.")]
-        keys = _telling(those, lambda key: key.startswith("dataset.") and key not in (*EVERYWHERE, BACKGROUNDS))
-        for run in those:
-            said[id(run)] += [f"{key}={run.rest.get(key, 'null')}" for key in keys]
-        tell_apart(those, keys, lambda run: run.metrics["protocol"], "")
-        tell_apart(those, data, lambda run: None if "warp_error" in run.metrics else run.metrics.get("data"), "data=")
-    more = {of: f" ({', '.join(words)})" if words else "" for of, words in said.items()}
+    for members in grouped(runs, lambda run: run.scene).values():
+        data = [key for run in members for key in run.rest if key.startswith("dataset.")]
+        keys = _telling(members, lambda key: key.startswith("dataset.") and key not in (*SHARED_KEYS, BACKGROUNDS))
+        for run in members:
+            note[id(run)] += [f"{key}={run.rest.get(key, 'null')}" for key in keys]
+        tell_apart(members, keys, lambda run: run.metrics["protocol"], "")
+        tell_apart(members, data, lambda run: None if "warp_error" in run.metrics else run.metrics.get("data"), "data=")
+    more = {of: f" ({', '.join(words)})" if words else "" for of, words in note.items()}
     return [replace(run, metrics=run.metrics | {"dataset": run.scene + more[id(run)]}) for run in runs]
 
 
@@ -85,36 +85,36 @@ def set_apart(runs: Sequence[Run]) -> tuple[list[Run], list[str]]:
     A key that only differs between scenes, such as ``backbone.coarse``, is in a note: rows are pooled over scenes.
     """
     more: dict[int, Setting] = {id(run): {} for run in runs}
-    told = set()
-    for of, concerns in KINDS:
-        for those in grouped(runs, lambda run, of=of: (run.setting["backbone"], of(run))).values():
-            scenes = grouped(those, lambda run: run.scene)
-            within = {key for of_scene in scenes.values() for key in _telling(of_scene, concerns, CHOICES)}
-            for key in within.union(_telling(those, concerns, CHOICES)):
-                for run in those:
+    notes = set()
+    for of, concerns in COMPARISONS:
+        for members in grouped(runs, lambda run, of=of: (run.setting["backbone"], of(run))).values():
+            scenes = grouped(members, lambda run: run.scene)
+            within = {key for of_scene in scenes.values() for key in _telling(of_scene, concerns, CAUSE_KEYS)}
+            for key in within.union(_telling(members, concerns, CAUSE_KEYS)):
+                for run in members:
                     name, value = "trainer" if key == BUDGET else key, run.rest.get(key, "null")
                     if value == "null" and weights({key: value}):  # of 0: it is among the setting's own
                         continue
                     if key in within:
                         more[id(run)][name] = value
                     else:
-                        told.add((name, run.setting["backbone"], run.scene, value))
+                        notes.add((name, run.setting["backbone"], run.scene, value))
     runs = [replace(run, setting=run.setting | dict(sorted(more[id(run)].items()))) for run in runs]
-    return runs, [f"All of {backbone} on {scene}: {key}={value}." for key, backbone, scene, value in sorted(told)]
+    return runs, [f"All of {backbone} on {scene}: {key}={value}." for key, backbone, scene, value in sorted(notes)]
 
 
 def _of(*sections: str) -> Callable[[str], bool]:
-    return lambda key: key.partition(".")[0] in sections and key not in EVERYWHERE
+    return lambda key: key.partition(".")[0] in sections and key not in SHARED_KEYS
 
 
-KINDS: tuple[tuple[Callable[[Run], Any], Callable[[str], bool]], ...] = (
-    (lambda run: (), lambda key: key in EVERYWHERE or _of("backbone", "trainer")(key)),
+COMPARISONS: tuple[tuple[Callable[[Run], Any], Callable[[str], bool]], ...] = (
+    (lambda run: (), lambda key: key in SHARED_KEYS or _of("backbone", "trainer")(key)),
     (lambda run: run.setting["ctm"], _of("ctm")),
     (lambda run: run.setting["appearance"], _of("appearance")),
     # Random backgrounds are a transform's own: they set apart what would be one run.
     (lambda run: (run.key, run.scene), lambda key: key == BACKGROUNDS),
 )
-"""Of which runs of a backbone which keys are compared."""
+"""Pairs of functions: which group a run is compared in, and which keys are compared there."""
 
 
 def _telling(runs: Sequence[Run], concerns: Callable[[str], bool], choices: Sequence[str] = ()) -> list[str]:
@@ -128,8 +128,8 @@ def _telling(runs: Sequence[Run], concerns: Callable[[str], bool], choices: Sequ
         return len({run.rest.get(key) for run in runs} - ({None} if weights({key: None}) else set())) > 1
 
     keys = sorted({key for run in runs for key in run.rest if concerns(key)})
-    own = [key for key in keys if differs(key) and (key in EVERYWHERE or kinds(*choices, key) > kinds(*choices))]
-    if len(own) <= MOST_KEYS:
+    own = [key for key in keys if differs(key) and (key in SHARED_KEYS or kinds(*choices, key) > kinds(*choices))]
+    if len(own) <= MAX_KEYS:
         return own
     named: list[str] = []
     for key in own:
@@ -140,20 +140,20 @@ def _telling(runs: Sequence[Run], concerns: Callable[[str], bool], choices: Sequ
 def others(setting: Setting) -> Setting:
     """Keys in which runs of a report differ besides those that the paper's tables vary."""
     zeros = {key for key, value in weights(setting).items() if value in (None, "0")}
-    return {key: value for key, value in setting.items() if key not in (*OWN, *zeros)}
+    return {key: value for key, value in setting.items() if key not in (*PAPER_KEYS, *zeros)}
 
 
 def names(settings: Iterable[Setting]) -> dict[tuple, str]:
     """Name settings by the keys in which they differ, such as ``ctm=quick ctm.P=2``, without what most have."""
-    found = list({tuple(setting.items()): setting for setting in settings}.values())
-    counts, unsaid = _counts(found), BASE | most_have(found)
+    unique = list({tuple(setting.items()): setting for setting in settings}.values())
+    counts, unsaid = _counts(unique), UNNAMED_VALUES | most_have(unique)
 
     def name(keys: Setting) -> str:
-        said = [key for key, value in keys.items() if len(counts[key]) > 1 and value not in (None, unsaid.get(key))]
-        own = [key for key in ("backbone", "ctm", *BASE) if keys[key] != BASE.get(key)]
-        return " ".join(f"{key}={keys[key]}" for key in said or own)
+        parts = [key for key, value in keys.items() if len(counts[key]) > 1 and value not in (None, unsaid.get(key))]
+        own = [key for key in ("backbone", "ctm", *UNNAMED_VALUES) if keys[key] != UNNAMED_VALUES.get(key)]
+        return " ".join(f"{key}={keys[key]}" for key in parts or own)
 
-    return {tuple(setting.items()): name(setting) for setting in found}
+    return {tuple(setting.items()): name(setting) for setting in unique}
 
 
 def most_have(settings: Sequence[Setting]) -> dict[str, str]:
@@ -173,13 +173,13 @@ def _counts(settings: Iterable[Setting]) -> dict[str, Counter]:
 
 def differing(one: Setting, other: Setting) -> set[str]:
     """Find keys that two settings both have and have differently; a backbone's and a transform's own follow from it."""
-    found = {key for key in one.keys() & other.keys() if one[key] != other[key]}
-    return {key for key in found if key.partition(".")[0] == key or key.partition(".")[0] not in found}
+    keys = {key for key in one.keys() & other.keys() if one[key] != other[key]}
+    return {key for key in keys if key.partition(".")[0] == key or key.partition(".")[0] not in keys}
 
 
 def grouped(runs: Iterable[Run], of: Callable[[Run], Hashable]) -> dict[Any, list[Run]]:
     """Sort runs by something that they share."""
-    found: dict[Any, list[Run]] = defaultdict(list)
+    groups: dict[Any, list[Run]] = defaultdict(list)
     for run in runs:
-        found[of(run)].append(run)
-    return found
+        groups[of(run)].append(run)
+    return groups

@@ -29,22 +29,22 @@ from ctm_plugin.report.text import written
 from ctm_plugin.runs.rundir import PAGE
 
 CURVES = {"psnr/test_view": "PSNR of a test view, dB", "psnr/rgb": "PSNR of the training pixels, dB"}
-"""Tags and what they are; the first that all runs have enough points of is drawn."""
-ENOUGH = 3
-"""Points of a curve."""
-SPEED = "speed/ms_per_step"
-KINDS = ("lit", "dark", "latent", "depth", "warps", "patches", "fused")
+"""Tags of curves and their titles; the first that all runs have enough points of is drawn."""
+MIN_POINTS = 3
+"""Least number of points of a curve."""
+SPEED_TAG = "speed/ms_per_step"
+PICTURE_KINDS = ("lit", "dark", "latent", "depth", "warps", "patches", "fused")
 
 
-def page(tables: Sequence[Table], found: Found, home: Path) -> str:
+def page(tables: Sequence[Table], group: Found, home: Path) -> str:
     """HTML that needs nothing else, with links from the folder ``home`` to runs' own pages; names are escaped."""
     environment = Environment(loader=PackageLoader("ctm_plugin.report", "."), autoescape=True)
     return environment.get_template("page.html.jinja").render(
         tables=[written(table, "html") for table in tables],
-        scenes=[shown(scene, runs) for scene, runs in first_seeds(found.runs).items()],
-        left_out=found.left_out,
-        pages={str(run.folder): link(run.folder / PAGE, home) for run in found.runs if (run.folder / PAGE).is_file()},
-        count=len(found.runs),
+        scenes=[scene_entry(scene, runs) for scene, runs in first_seeds(group.runs).items()],
+        left_out=group.left_out,
+        pages={str(run.folder): link(run.folder / PAGE, home) for run in group.runs if (run.folder / PAGE).is_file()},
+        count=len(group.runs),
         version=__version__,
     )
 
@@ -60,12 +60,12 @@ def first_seeds(runs: Sequence[Run]) -> dict[str, list[Run]]:
     return {scene: [min(members, key=lambda run: run.seed) for _, members in own] for scene, own in rows.items()}
 
 
-def shown(scene: str, runs: Sequence[Run]) -> dict:
+def scene_entry(scene: str, runs: Sequence[Run]) -> dict:
     """Runs of a scene: the photograph and sliders between any two, the window where two differ most, curves.
 
     First it shows plain RGB and ``ctm=auto``, or another transform where that is not there.
     """
-    layers = {kind: of_kind for kind in KINDS if (of_kind := layers_of(kind, runs))}
+    layers = {kind: of_kind for kind in PICTURE_KINDS if (of_kind := layers_of(kind, runs))}
     numbers = sorted({number for of_kind in layers.values() for number in of_kind})
     both = pairs([run for run in runs if run.setting["ctm"] in ("off", "auto")]) or pairs(runs)
     first, second = [1 + runs.index(run) for run in both[0]] if both else (numbers * 2)[:2] or (0, 0)
@@ -94,19 +94,19 @@ def shown(scene: str, runs: Sequence[Run]) -> dict:
 def layers_of(kind: str, runs: Sequence[Run]) -> dict[int, np.ndarray]:
     """Pictures ``[H, W, 3]`` of a kind by number: 0 is the photograph, with lit ones, then come the runs'."""
     photographed = [run for run in runs if kind == "lit" and "photo" in pictures(run)]
-    found = {0: picture(photographed[0], "photo")} if photographed else {}
-    return found | {n: picture(run, kind) for n, run in enumerate(runs, 1) if kind in pictures(run)}
+    layers = {0: picture(photographed[0], "photo")} if photographed else {}
+    return layers | {n: picture(run, kind) for n, run in enumerate(runs, 1) if kind in pictures(run)}
 
 
 def windows_of(pictures: Mapping[int, np.ndarray]) -> dict[str, list[int]]:
     """Where any two pictures ``[H, W, 3]`` of one size differ most: left, top, width, height by both numbers."""
-    found = {}
+    windows = {}
     for (one, first), (other, second) in itertools.combinations(pictures.items(), 2):
         if first.shape == second.shape:
             rows, columns = where_they_differ(first, second)
             size = columns.stop - columns.start, rows.stop - rows.start
-            found[f"{one} {other}"] = [columns.start, rows.start, *size]
-    return found
+            windows[f"{one} {other}"] = [columns.start, rows.start, *size]
+    return windows
 
 
 def embedded(content: np.ndarray | bytes) -> str:
@@ -125,14 +125,14 @@ class Curve(NamedTuple):
 
 def curves(runs: Mapping[str, Path]) -> str | None:
     """PSNR of runs, by name and folder, against steps and time, as a data URL; ``None`` where none has a curve."""
-    found = {name: each for name, folder in runs.items() if (each := curves_of(folder))}
-    tags = [tag for tag in CURVES if found and all(tag in each for each in found.values())]
+    curves_by_run = {name: each for name, folder in runs.items() if (each := curves_of(folder))}
+    tags = [tag for tag in CURVES if curves_by_run and all(tag in each for each in curves_by_run.values())]
     if not tags:
         return None
-    tag = max(tags, key=lambda tag: min(ENOUGH, *(len(each[tag].steps) for each in found.values())))
-    figure = Figure(figsize=(9, 2.8 + 0.16 * len(found)), layout="constrained")  # the legend takes a line a run
+    tag = max(tags, key=lambda tag: min(MIN_POINTS, *(len(each[tag].steps) for each in curves_by_run.values())))
+    figure = Figure(figsize=(9, 2.8 + 0.16 * len(curves_by_run)), layout="constrained")  # the legend takes a line a run
     over_steps, over_time = figure.subplots(1, 2, sharey=True)
-    for name, each in found.items():
+    for name, each in curves_by_run.items():
         over_steps.plot(each[tag].steps, each[tag].values, label=name)
         over_time.plot(each[tag].minutes, each[tag].values)
     over_steps.set(xlabel="step", ylabel=CURVES[tag])
@@ -158,8 +158,8 @@ def curves_of(run: Path) -> dict[str, Curve]:
         events.Reload()
     except (DecodeError, ValueError, OverflowError, MemoryError) as error:  # lengths that a file claims are believed
         raise CheckpointError(folder, f"no readable curves ({type(error).__name__})", "TensorBoard's files") from error
-    points = {tag: events.Scalars(tag) for tag in (*CURVES, SPEED) if tag in events.Tags()["scalars"]}
-    clock = [(0, 0.0), *((point.step, point.value / 60_000) for point in points.pop(SPEED, []))]
+    points = {tag: events.Scalars(tag) for tag in (*CURVES, SPEED_TAG) if tag in events.Tags()["scalars"]}
+    clock = [(0, 0.0), *((point.step, point.value / 60_000) for point in points.pop(SPEED_TAG, []))]
     steps, each = (np.array(column, dtype=float) for column in zip(*clock, strict=True))
     minutes = np.cumsum(each * np.diff(steps, prepend=0))  # only of the training: a run may have waited
     return {

@@ -12,8 +12,8 @@ from ctm_plugin.errors import CheckpointError
 from ctm_plugin.report.labels import differing
 from ctm_plugin.report.runs import Run, weights
 
-CROP = 4
-"""A crop's sides are this part of the picture's."""
+CROP_DIVISOR = 4
+"""Ratio of a picture's sides to those of its crop."""
 
 
 def pictures(run: Run) -> dict[str, Path]:
@@ -44,14 +44,14 @@ def pairs(runs: Sequence[Run]) -> list[tuple[Run, Run]]:
 
     The first seed that both have; CTM as its preset has it, all terms and the paper's sizes, where there is a choice.
     """
-    found: dict[tuple, tuple[Run, Run]] = {}
+    pairs_by_key: dict[tuple, tuple[Run, Run]] = {}
     for on in sorted((run for run in runs if run.setting["ctm"] != "off"), key=_distance):
         s = on.setting
         for off in (run for run in runs if run.setting["ctm"] == "off" and s["color_space"] == "rgb"):
             if (off.scene, off.seed) == (on.scene, on.seed) and differing(s, off.setting) == {"ctm"}:
                 key = (on.scene, s["backbone"], s.get("backbone.encoding", ""), s["appearance"], s["loss"] is not None)
-                found.setdefault(key, (off, on))
-    return [found[key] for key in sorted(found)]
+                pairs_by_key.setdefault(key, (off, on))
+    return [pairs_by_key[key] for key in sorted(pairs_by_key)]
 
 
 def _distance(run: Run) -> tuple[int, bool, bool, int]:
@@ -67,7 +67,7 @@ def where_they_differ(first: np.ndarray, second: np.ndarray) -> tuple[slice, sli
     """
     difference = first.astype(np.int16) - second
     difference = np.abs(difference - np.median(difference, axis=(0, 1)).astype(np.int16)).sum(-1, dtype=np.int64)
-    height, width = (max(1, side // CROP) for side in difference.shape)
+    height, width = (max(1, side // CROP_DIVISOR) for side in difference.shape)
     sums = np.pad(difference.cumsum(0).cumsum(1), ((1, 0), (1, 0)))
     windows = sums[height:, width:] - sums[:-height, width:] - sums[height:, :-width] + sums[:-height, :-width]
     top, left = np.unravel_index(int(windows.argmax()), windows.shape)

@@ -9,21 +9,27 @@ from pathlib import Path
 from typing import Any
 
 from ctm_plugin.errors import CheckpointError, printable
-from ctm_plugin.runs.rundir import CONFIG, ERROR, METRICS, check_folder, read_json, read_yaml
+from ctm_plugin.runs.rundir import CONFIG, ERROR, METRICS, read_json, read_yaml
 from ctm_plugin.settings.listing import leaves
 from ctm_plugin.settings.setting import is_number
 
-LONGEST = 10_000
-"""Characters of a failed run's error that are shown."""
-LARGEST = 1e9
-"""What no score reaches."""
-TERMS = ("enc", "dec", "img", "rand", "latent")
-NAMES = {"backbone": "name", "ctm": "name", "color_space": "name", "loss": "kind", "appearance": "name"}
-"""Sections and their key that is a choice: texts."""
-ELSEWHERE = {"backbone.encoding", "ctm.P", "ctm.k", *(f"dataset.{key}" for key in ("root", "image", "seed", "scene"))}
-"""Keys of the setting, and of where data are."""
+MAX_ERROR = 10_000
+"""Most characters of a failed run's error that are shown."""
+MAX_SCORE = 1e9
+"""Number that no score reaches."""
+LOSS_TERMS = ("enc", "dec", "img", "rand", "latent")
+"""Terms of the transform's loss."""
+CHOICE_KEYS = {"backbone": "name", "ctm": "name", "color_space": "name", "loss": "kind", "appearance": "name"}
+"""Sections of a configuration and their key that names the choice."""
+LOCATION_KEYS = {
+    "backbone.encoding",
+    "ctm.P",
+    "ctm.k",
+    *(f"dataset.{key}" for key in ("root", "image", "seed", "scene")),
+}
+"""Keys that say where the data lie, and keys that belong to the setting."""
 Setting = dict[str, str | None]
-"""Keys of the command line and values; ``None``: the preset's own, which is not said."""
+"""Keys of a command line and their values; ``None`` is the preset's own value."""
 
 
 @dataclass(frozen=True)
@@ -66,7 +72,7 @@ class Run:
     def value(self, metric: str) -> float | None:
         """A score; ``None`` where it is none, NaN included, or so large that means would overflow."""
         value = self.metrics.get(metric)
-        return float(value) if is_number(value) and abs(value) < LARGEST else None
+        return float(value) if is_number(value) and abs(value) < MAX_SCORE else None
 
 
 def read_runs(folders: Sequence[Path]) -> tuple[list[Run], list[str]]:
@@ -75,22 +81,21 @@ def read_runs(folders: Sequence[Path]) -> tuple[list[Run], list[str]]:
     Raises:
         CheckpointError: a folder is missing or holds no run.
     """
-    found: dict[Path, Run | str] = {}
+    runs_by_folder: dict[Path, Run | str] = {}
     for folder in folders:
         paths = sorted({path.parent for name in (CONFIG, ERROR) for path in folder.rglob(name)})
         if not paths:
             why = f"no {CONFIG} in it or below" if folder.is_dir() else "no such directory"
             raise CheckpointError(folder, why, "a run directory, or a folder of them")
         for run in paths:
-            if run.resolve() not in found:
-                found[run.resolve()] = _run_or_reason(run)
-    runs = [run for run in found.values() if isinstance(run, Run)]
-    return runs, [why for why in found.values() if isinstance(why, str)]
+            if run.resolve() not in runs_by_folder:
+                runs_by_folder[run.resolve()] = _run_or_reason(run)
+    runs = [run for run in runs_by_folder.values() if isinstance(run, Run)]
+    return runs, [why for why in runs_by_folder.values() if isinstance(why, str)]
 
 
 def _run_or_reason(folder: Path) -> Run | str:
     try:
-        check_folder(folder)
         if (folder / METRICS).exists():
             return read_run(folder)
     except CheckpointError as error:
@@ -98,7 +103,7 @@ def _run_or_reason(folder: Path) -> Run | str:
     if not (folder / ERROR).is_file():
         return f"{folder.resolve()}: not finished"
     with (folder / ERROR).open(encoding="utf-8", errors="replace") as file:
-        return "\n".join(printable(line) for line in f"{folder.resolve()}: {file.read(LONGEST).strip()}".splitlines())
+        return "\n".join(printable(line) for line in f"{folder.resolve()}: {file.read(MAX_ERROR).strip()}".splitlines())
 
 
 def read_run(folder: Path) -> Run:
@@ -115,7 +120,7 @@ def read_run(folder: Path) -> Run:
         _check_metrics(metrics)
         file, expected = CONFIG, "a run's configuration"
         _check("seed", config["seed"], isinstance(config["seed"], int) and config["seed"] >= 0)
-        for section, key in NAMES.items():
+        for section, key in CHOICE_KEYS.items():
             _check(f"{section}.{key}", config[section][key], isinstance(config[section][key], str))
         return Run(folder, config, metrics, _setting(config, "warp_error" in metrics), _rest(config))
     except (KeyError, TypeError, AttributeError, ValueError) as error:
@@ -152,7 +157,7 @@ def _setting(config: Mapping[str, Any], aligned: bool) -> Setting:
         # An alignment has no use for the random colours: there their weights are 0 in every preset.
         zeros = {term for term, weight in ctm.get("weights", {}).items() if weight == 0}
         zeros -= {"rand", "latent"} if aligned else set()
-        terms = {f"ctm.weights.{term}": "0" if term in zeros else None for term in TERMS}
+        terms = {f"ctm.weights.{term}": "0" if term in zeros else None for term in LOSS_TERMS}
     return setting | {key: str(value) for key, value in sizes.items() if value is not None} | terms
 
 
@@ -166,16 +171,16 @@ def preset_of(config: Mapping[str, Any]) -> str:
 
 def _rest(config: Mapping[str, Any]) -> dict[str, str]:
     """Everything else that scores depend on: without seeds, paths, and how often something is logged."""
-    found = dict(leaves({section: config[section] for section in ("backbone", "ctm", "appearance", "dataset")}))
+    values = dict(leaves({section: config[section] for section in ("backbone", "ctm", "appearance", "dataset")}))
     for section, keys in {
         "dataset": ("geometry", "near", "far", "background_level"),
         "loss": ("weight",),
         "metrics": ("lpips_net",),
         "trainer": ("budget", "precision", "accumulate_grad_batches", "gradient_clip_val"),
     }.items():
-        found |= {f"{section}.{key}": config.get(section, {}).get(key) for key in keys}
-    none = {key for key, weight in weights(found).items() if not weight}
-    return {key: _as_typed(value) for key, value in found.items() if key not in ELSEWHERE | none}
+        values |= {f"{section}.{key}": config.get(section, {}).get(key) for key in keys}
+    none = {key for key, weight in weights(values).items() if not weight}
+    return {key: _as_typed(value) for key, value in values.items() if key not in LOCATION_KEYS | none}
 
 
 def _as_typed(value: Any) -> str:

@@ -26,8 +26,8 @@ class ReportConfig(Settings):
     )
     format: str = setting(
         "md",
-        "format of tables: md, csv, latex or html; evidence: one row of scores a run, added to the CSV file out",
-        choices=("md", "csv", "latex", "html", "evidence"),
+        "format of tables: md, csv, latex or html",
+        choices=("md", "csv", "latex", "html"),
     )
     out: str | None = setting(
         None,

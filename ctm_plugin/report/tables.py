@@ -17,29 +17,32 @@ from ctm_plugin.errors import CTMError
 from ctm_plugin.metrics.evaluate import is_measurement, no_measurement
 from ctm_plugin.metrics.table import METRICS, told_at
 from ctm_plugin.report.cells import Cell, Column, Rows, Table, cell_of, columns_of
-from ctm_plugin.report.labels import BACKGROUNDS, BASE, Found, differing, grouped, most_have, others
+from ctm_plugin.report.labels import BACKGROUNDS, UNNAMED_VALUES, Found, differing, grouped, most_have, others
 from ctm_plugin.report.runs import Run, Setting, weights
 
 DATA: dict[str, Any] = yaml.load((files(__package__) / "tables.yaml").read_text(encoding="utf-8"), yaml.BaseLoader)
+"""Contents of ``tables.yaml``."""
 PAPER: dict[int, dict[str, Any]] = {int(number): DATA["methods"] | table for number, table in DATA["tables"].items()}
-LIT = DATA["lit"]
-FIRST = {"ctm": "off"} | BASE
-"""Values that others are compared with, where there are such runs."""
+"""The paper's tables by their number."""
+LIT_TABLE = DATA["lit"]
+"""Published scores of lit views."""
+NO_CTM = {"ctm": "off"} | UNNAMED_VALUES
+"""Values of the row that others are compared with, where there are such runs."""
 Named = Iterator[tuple[str, list[Run]]]
 
 
-def choose(found: Found, number: int | None, data: str | None) -> list[Table]:
+def choose(group: Found, number: int | None, data: str | None) -> list[Table]:
     """The table that was asked for; else all runs, lit views where there are references, and tables of the paper.
 
     These are of runs of the paper's data sets, each of those of Tables 1 to 7 that show most: a table of which one
     setting has runs is left out, and one whose settings all stand in another.
     """
     if data is not None or number is not None:
-        return [paper_table(number or 1, data, found.runs)]
-    tables = [all_runs(found)]
-    if lit := [run for run in found.runs if run.value("psnr_lit") is not None]:
+        return [paper_table(number or 1, data, group.runs)]
+    tables = [all_runs(group)]
+    if lit := [run for run in group.runs if run.value("psnr_lit") is not None]:
         tables.append(lit_views(lit))
-    for name, own in sorted(grouped(found.runs, lambda run: data_of(run) or "").items()):
+    for name, own in sorted(grouped(group.runs, lambda run: data_of(run) or "").items()):
         possible = [number for number in range(1, 8) if name in datasets(number)]
         filled = [{run.key for *_, runs in by_row(PAPER[number], own) for run in runs} for number in possible]
         for index, (number, settings) in enumerate(zip(possible, filled, strict=True)):
@@ -52,16 +55,16 @@ def choose(found: Found, number: int | None, data: str | None) -> list[Table]:
 # All runs
 
 
-def all_runs(found: Found) -> Table:
+def all_runs(group: Found) -> Table:
     """A row for each setting on each scene, and on the mean over a backbone's scenes.
 
     Below, differences of the same scene and seed between settings that differ in one key. Where closed forms were
     swept, also from the one that scores best on that scene, for each metric its own: chosen by the very scores that are
     compared, which no single closed form can be above.
     """
-    runs, rows = found.runs, configurations(found.runs)
+    runs, rows = group.runs, configurations(group.runs)
     columns = columns_of((name for name in told_at("report") if any(run.value(name) is not None for run in runs)), runs)
-    table = Table("All runs", columns, notes=[*notes_of(runs), *found.shared])
+    table = Table("All runs", columns, notes=[*notes_of(runs), *group.shared])
     if common := most_have([members[0].setting for _, members in rows]):
         table.notes.append(f"In all rows without other values: {' '.join(f'{k}={v}' for k, v in common.items())}.")
     # Runs of experiment=colors: some have only a fixed space that is in no table of the paper.
@@ -81,10 +84,10 @@ def configurations(runs: Sequence[Run]) -> Rows:
     def order(runs: list[Run]) -> list[tuple]:
         keys = runs[0].setting
         return [
-            _sortable(value) for value in (keys["backbone"], *(keys[k] != v for k, v in FIRST.items()), *keys.values())
+            _sortable(value) for value in (keys["backbone"], *(keys[k] != v for k, v in NO_CTM.items()), *keys.values())
         ]
 
-    return [(those[0].label, those) for those in sorted(grouped(runs, lambda run: run.key).values(), key=order)]
+    return [(members[0].label, members) for members in sorted(grouped(runs, lambda run: run.key).values(), key=order)]
 
 
 def _sortable(value: Any) -> tuple[float, str]:
@@ -96,11 +99,11 @@ def _sortable(value: Any) -> tuple[float, str]:
 
 def by_scene(rows: Rows) -> dict[str, Rows]:
     """The rows of each scene."""
-    found: dict[str, Rows] = {}
+    groups: dict[str, Rows] = {}
     for label, members in rows:
         for scene, own in grouped(members, lambda run: run.scene).items():
-            found.setdefault(scene, []).append((label, own))
-    return dict(sorted(found.items()))
+            groups.setdefault(scene, []).append((label, own))
+    return dict(sorted(groups.items()))
 
 
 def blocks_of(rows: Rows) -> list[tuple[str, Rows]]:
@@ -129,7 +132,7 @@ def _compared(rows: Rows, closed: bool, runs: list[Run], column: Column) -> Name
         values = [other.get(key) for other in settings]
         counts = Counter(values)
         there = [value for value, keys in zip(values, apart, strict=True) if keys == {key}] + [setting[key]]
-        best = min(there, key=lambda value: (value != FIRST.get(key), -counts[value], values.index(value)))
+        best = min(there, key=lambda value: (value != NO_CTM.get(key), -counts[value], values.index(value)))
         if best != setting[key]:
             yield from (row for row, keys, v in zip(rows, apart, values, strict=True) if keys == {key} and v == best)
     if closed and (len({run.scene for run in runs}) > 1 or setting["ctm"] != "off"):
@@ -137,7 +140,7 @@ def _compared(rows: Rows, closed: bool, runs: list[Run], column: Column) -> Name
 
 
 def _best_closed_form(rows: Rows, setting: Setting, column: Column) -> tuple[str, list[Run]]:
-    """Of each scene the runs of the fixed space that is best in a column there; of those that most seeds have."""
+    """Choose for each scene the runs of the fixed space that is best in a column; of those that most seeds have."""
     forms = [
         run
         for _, members in rows
@@ -165,33 +168,35 @@ def lit_views(runs: Sequence[Run]) -> Table:
     setting with the colour map that was fitted to the references, an oracle; and of LOM's scenes the published values.
     """
     low = [run for run in runs if {"dark": "low", "lit": "high"}.items() <= run.config["dataset"].items()]
-    lom = {run.scene for run in low} & LIT["values"].keys()
+    lom = {run.scene for run in low} & LIT_TABLE["values"].keys()
     fitted = ["psnr_fitted"] * any(run.setting["appearance"] != "none" for run in runs)
-    columns = columns_of([*LIT["metrics"], "psnr", *fitted], runs, [LIT["net"]] * bool(lom))
-    found = Table("Lit views", columns, notes=[LIT["note"], *[LIT["published"]] * bool(lom), *notes_of(runs)])
+    columns = columns_of([*LIT_TABLE["metrics"], "psnr", *fitted], runs, [LIT_TABLE["net"]] * bool(lom))
+    table = Table(
+        "Lit views", columns, notes=[LIT_TABLE["note"], *[LIT_TABLE["published"]] * bool(lom), *notes_of(runs)]
+    )
 
     def of(which: str, runs: Sequence[Run]) -> list[Cell]:
         """The same scores of other pictures, such as ``psnr_lit_photo``; there are none of other columns."""
-        metrics = [column.metric + which if column.metric in LIT["metrics"] else "" for column in columns]
+        metrics = [column.metric + which if column.metric in LIT_TABLE["metrics"] else "" for column in columns]
         return [cell_of(runs, replace(each, metric=metric)) for each, metric in zip(columns, metrics, strict=True)]
 
     def published(name: str) -> Iterator[tuple[str, list[Cell]]]:
-        for method, values in LIT["values"][name].items():
-            known = dict(zip(LIT["metrics"], map(float, values), strict=True))
-            theirs = [known.get(each.metric) if each.net in (None, LIT["net"]) else None for each in columns]
+        for method, values in LIT_TABLE["values"][name].items():
+            known = dict(zip(LIT_TABLE["metrics"], map(float, values), strict=True))
+            theirs = [known.get(each.metric) if each.net in (None, LIT_TABLE["net"]) else None for each in columns]
             yield f"{name}: {method}, as published", [Cell(paper=value) for value in theirs]
 
     for name, rows in blocks_of(configurations(runs)):
-        found.add(rows, f"{name}: ")
+        table.add(rows, f"{name}: ")
         photographs = {run.scene: run for run in rows[0][1]}  # the same for all without an appearance, which come first
         label = f"{name}: the dark photographs themselves, lit"
-        found.rows.append((label, of("_photo", list(photographs.values()))))
+        table.rows.append((label, of("_photo", list(photographs.values()))))
         for label, members in rows:
             oracle = f"{name}: {label}, colours fitted to the references (an oracle)"
-            found.rows.append((oracle, of("_fitted", members)))
-        found.rows += published(name) if name in lom else []
-    found.rows += published(LIT["mean"]) if lom else []
-    return found
+            table.rows.append((oracle, of("_fitted", members)))
+        table.rows += published(name) if name in lom else []
+    table.rows += published(LIT_TABLE["mean"]) if lom else []
+    return table
 
 
 # The paper's
@@ -221,14 +226,14 @@ def paper_table(number: int, data: str | None, runs: Sequence[Run]) -> Table:
     if "title" not in given:  # by scene
         (metric,) = given["metrics"]
         columns = [*(Column(scene, metric, scene) for scene in scenes), Column("mean", metric)]
-    found = Table(f"Table {number}: {given.get('title') or given['metrics'][0].upper() + ' by scene'}", columns, name)
-    found.add([row[1:] for row in rows], "", len(scenes), partial(_references, number, rows))
-    for (row, _, members), (_, cells) in zip(rows, found.rows, strict=True):
+    table = Table(f"Table {number}: {given.get('title') or given['metrics'][0].upper() + ' by scene'}", columns, name)
+    table.add([row[1:] for row in rows], "", len(scenes), partial(_references, number, rows))
+    for (row, _, members), (_, cells) in zip(rows, table.rows, strict=True):
         for cell, column in zip(cells, columns, strict=True):
             cell.paper = _paper_value(given["values"][name][row], given["metrics"], column, members) if name else None
     others = len(runs) - len({run.folder for run in used})
-    found.notes = notes_of(used) + [f"In no row of this table: {others} of the runs."] * bool(others)
-    return found
+    table.notes = notes_of(used) + [f"In no row of this table: {others} of the runs."] * bool(others)
+    return table
 
 
 def datasets(number: int) -> list[str]:
@@ -275,10 +280,10 @@ def by_row(table: Mapping[str, Any], runs: Sequence[Run]) -> list[tuple[str, str
     backbones, presets = {kind[0] for kind in kinds}, {kind[2] for kind in kinds} - {"off"}
 
     def label(backbone: str, _: int, preset: str, apart: tuple, name: str) -> str:
-        said = [backbone] if len(backbones) > 1 and backbone not in name.lower() else []
-        said += [preset] if preset != "off" and len(presets) > 1 else []
-        said += [f"{key}={value}" for key, value in apart]
-        return f"{name} ({', '.join(said)})" if said else name
+        extras = [backbone] if len(backbones) > 1 and backbone not in name.lower() else []
+        extras += [preset] if preset != "off" and len(presets) > 1 else []
+        extras += [f"{key}={value}" for key, value in apart]
+        return f"{name} ({', '.join(extras)})" if extras else name
 
     return [(kind[-1], label(*kind), kinds[kind]) for kind in sorted(kinds)]
 
@@ -292,16 +297,16 @@ def _references(number: int, rows: Sequence[tuple[str, str, list[Run]]], runs: l
     without = row.removesuffix(" w/ CTM")
     against = without if without != row and without in table["rows"] else table["against"]
     against = table.get("compared", {}).get(row, against)
-    for name, label, those in rows:
-        other = those[0].setting
+    for name, label, peers in rows:
+        other = peers[0].setting
         if (
             name == against
             and other["ctm"] in ("off", setting["ctm"])
             and not differing(setting, other) & others(setting).keys()
             and (setting["backbone"] == other["backbone"] or number == 1)
         ):
-            if those is not runs:
-                yield label, those
+            if peers is not runs:
+                yield label, peers
             return
 
 
@@ -331,10 +336,10 @@ def notes_of(runs: Sequence[Run]) -> list[str]:
         notes.insert(0, "No run converged: none is 1 dB better than the best constant colour.")
     notes.append(f"Budget: {', '.join(budgets)}.")
     random = [run for run in runs if run.rest.get("dataset.background") in ("random", "random_matched")]
-    for scene, those in sorted(grouped(random, lambda run: run.scene).items()):
-        by_ctm = sorted(grouped(those, lambda run: run.setting["ctm"]).items())
+    for scene, members in sorted(grouped(random, lambda run: run.scene).items()):
+        by_ctm = sorted(grouped(members, lambda run: run.setting["ctm"]).items())
         levels = {ctm: sorted({run.rest[BACKGROUNDS] for run in of_ctm}) for ctm, of_ctm in by_ctm}
         if len(set().union(*levels.values())) > 1:
-            said = (f"{' and '.join(each)} for ctm={ctm}" for ctm, each in levels.items())
-            notes.append(f"{scene}: {BACKGROUNDS} is {', '.join(said)}.")
+            levels_by_ctm = (f"{' and '.join(each)} for ctm={ctm}" for ctm, each in levels.items())
+            notes.append(f"{scene}: {BACKGROUNDS} is {', '.join(levels_by_ctm)}.")
     return notes

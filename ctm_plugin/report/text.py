@@ -20,9 +20,10 @@ PAIRED = (
     "Differences of the same scene and seed, converged or not: mean, 95 % confidence interval (Student's t), pairs in "
     "brackets. Better or worse: the interval leaves 0 out."
 )
-MARKS = {"md": ("**{}**", "_{}_"), "latex": (r"\textbf{{{}}}", r"\underline{{{}}}"), "html": ("{} ●", "{} ○")}
-"""How the best and the second best of a column are written."""
-NAMES = {"md": ("**Best**", "_second best_"), "html": ("● best", "○ second best")}
+RANK_MARKS = {"md": ("**{}**", "_{}_"), "latex": (r"\textbf{{{}}}", r"\underline{{{}}}"), "html": ("{} ●", "{} ○")}
+"""Templates that mark the best and the second best of a column by format."""
+RANK_LEGENDS = {"md": ("**Best**", "_second best_"), "html": ("● best", "○ second best")}
+"""Words that explain these marks by format."""
 
 
 class Written(NamedTuple):
@@ -42,22 +43,24 @@ def spread(mean: float, std: float | None, decimals: int, sign: str = "") -> str
 
 
 def written(table: Table, form: str) -> Written:
-    """A table as text for a format of :data:`MARKS`."""
-    lines = [_headings(table), *(_line(table, *row, ("{}", *MARKS[form])) for row in table.rows)]
-    about = ABOUT.format(*NAMES.get(form, NAMES["md"])) + (PAPERS.format(data=table.data) if table.data else "")
+    """A table as text for a format of :data:`RANK_MARKS`."""
+    lines = [_headings(table), *(_line(table, *row, ("{}", *RANK_MARKS[form])) for row in table.rows)]
+    about = ABOUT.format(*RANK_LEGENDS.get(form, RANK_LEGENDS["md"])) + (
+        PAPERS.format(data=table.data) if table.data else ""
+    )
     below = [NOT_CONVERGED] if any("N.C." in cell for line in lines[1:] for cell in line) else []
     several = any(each.pairs > 1 for _, cells in table.rows for cell in cells for each in cell.differences)
-    said = PAIRED if several else ONE_SEED
-    return Written(table.title, [about, *table.notes], lines, below, said, _differences(table))
+    note = PAIRED if several else ONE_SEED
+    return Written(table.title, [about, *table.notes], lines, below, note, _differences(table))
 
 
 def _headings(table: Table) -> list[str]:
-    found = [""]
+    headings = [""]
     for column in table.columns:
         metric = METRICS[column.metric]
         unit = f", {metric.unit}" if metric.unit not in ("", "dB") else ""
-        found += [f"{column.label}{unit} {metric.arrow}", *(("paper", "difference") if table.data else ())]
-    return found
+        headings += [f"{column.label}{unit} {metric.arrow}", *(("paper", "difference") if table.data else ())]
+    return headings
 
 
 def _line(table: Table, label: str, cells: Sequence[Cell], marks: Sequence[str]) -> list[str]:
@@ -83,22 +86,22 @@ def _ours(cell: Cell, decimals: int) -> str:
 
 def _differences(table: Table) -> list[list[str]]:
     """Headings, and a line for each two rows with their paired differences; empty where there is none."""
-    found: dict[str, dict[Column, str]] = {}
+    texts_by_row: dict[str, dict[Column, str]] = {}
     for label, cells in table.rows:
         for cell, column in zip(cells, table.columns, strict=True):
             decimals = METRICS[column.metric].decimals
             for each in cell.differences:
-                found.setdefault(f"{label} - {each.against}", {})[column] = _paired(each, decimals)
-    columns = [column for column in table.columns if any(column in texts for texts in found.values())]
-    rows = [[label, *(texts.get(column, "-") for column in columns)] for label, texts in found.items()]
+                texts_by_row.setdefault(f"{label} - {each.against}", {})[column] = _paired(each, decimals)
+    columns = [column for column in table.columns if any(column in texts for texts in texts_by_row.values())]
+    rows = [[label, *(texts.get(column, "-") for column in columns)] for label, texts in texts_by_row.items()]
     return [["difference", *(column.label for column in columns)], *rows] if rows else []
 
 
-def _paired(found: Difference, decimals: int) -> str:
+def _paired(difference: Difference, decimals: int) -> str:
     """``mean ± half (pairs)``, and what it says."""
-    pairs = "" if found.half is None else f" ({found.pairs})"
-    verdict = {True: " better", False: " worse", None: ""}[found.better]
-    return spread(found.mean, found.half, decimals, "+") + pairs + verdict
+    pairs = "" if difference.half is None else f" ({difference.pairs})"
+    verdict = {True: " better", False: " worse", None: ""}[difference.better]
+    return spread(difference.mean, difference.half, decimals, "+") + pairs + verdict
 
 
 def pipes(lines: Sequence[Sequence[str]]) -> str:
@@ -109,10 +112,10 @@ def pipes(lines: Sequence[Sequence[str]]) -> str:
 
 def markdown(table: Table) -> str:
     """A table as Markdown, with all notes."""
-    found = written(table, "md")
-    parts = [f"### {found.title}", "", *found.above, "", pipes(found.lines), *("\n" + each for each in found.below)]
-    if found.differences:
-        parts += ["", found.about_differences, "", pipes(found.differences)]
+    text = written(table, "md")
+    parts = [f"### {text.title}", "", *text.above, "", pipes(text.lines), *("\n" + each for each in text.below)]
+    if text.differences:
+        parts += ["", text.about_differences, "", pipes(text.differences)]
     return "\n".join(parts) + "\n"
 
 
@@ -139,7 +142,7 @@ def csv_text(tables: Sequence[Table]) -> str:
 
 def latex(table: Table) -> str:
     """A ``booktabs`` table."""
-    found, heads = written(table, "latex"), ["ours", "paper", "diff."] if table.data else ["ours"]
+    text, heads = written(table, "latex"), ["ours", "paper", "diff."] if table.data else ["ours"]
     groups = " & ".join(
         rf"\multicolumn{{{len(heads)}}}{{c}}{{{_escaped(f'{each.label} {METRICS[each.metric].arrow}')}}}"
         for each in table.columns
@@ -147,10 +150,10 @@ def latex(table: Table) -> str:
     return "\n".join(
         [
             r"\begin{table}", r"\centering",
-            rf"\caption{{{_escaped(table.title)}. {_escaped(' '.join([*table.notes, *found.below]))}}}",
+            rf"\caption{{{_escaped(table.title)}. {_escaped(' '.join([*table.notes, *text.below]))}}}",
             rf"\begin{{tabular}}{{l{'r' * len(heads) * len(table.columns)}}}", r"\toprule",
             rf" & {groups} \\", " & ".join(["", *(heads * len(table.columns))]) + r" \\", r"\midrule",
-            *(" & ".join(map(_escaped, line)) + r" \\" for line in found.lines[1:]),
+            *(" & ".join(map(_escaped, line)) + r" \\" for line in text.lines[1:]),
             r"\bottomrule", r"\end{tabular}", r"\end{table}", "",
         ]
     )  # fmt: skip
@@ -167,4 +170,4 @@ FORMATS = {
     "csv": csv_text,
     "latex": lambda tables: "\n".join(map(latex, tables)),
 }
-"""Tables to text."""
+"""Function that writes tables as text by format."""

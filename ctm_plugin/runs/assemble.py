@@ -11,10 +11,9 @@ from typing import Any
 import lightning as L
 
 from ctm_plugin.backbones.base import Backbone
-from ctm_plugin.callbacks.attach_ctm import AttachTransform
 from ctm_plugin.color.photometric import Photometric
-from ctm_plugin.color.settings import TransformTraining
 from ctm_plugin.color.transform import Chain, ColorTransform
+from ctm_plugin.data.capture import Capture
 from ctm_plugin.draws import seeded
 from ctm_plugin.errors import ConfigError, CTMError
 from ctm_plugin.loggers.base import RunLogger
@@ -32,14 +31,15 @@ class Parts:
 
     scene: Any
     backbone: Backbone
-    attach: AttachTransform
     trainer: TrainerConfig
     metrics: MetricsConfig
     loggers: list[RunLogger] = field(default_factory=list)
     callbacks: list[L.Callback] = field(default_factory=list)
 
 
-def assemble(config: Config, run: Path | None = None, step: int = 0, scene: Any = None) -> Parts:
+def assemble(
+    config: Config, run: Path | None = None, step: int = 0, scene: Any = None, capture: Capture | None = None
+) -> Parts:
     """Build everything a configuration names, checking all of it before any data is read.
 
     Args:
@@ -47,6 +47,7 @@ def assemble(config: Config, run: Path | None = None, step: int = 0, scene: Any 
         run: the directory of a run that is to be trained, from ``step`` on. Loggers and callbacks are only built for
             it: scoring does not need their packages.
         scene: takes the place of the configuration's, whose data are gone.
+        capture: of the configuration's data, where they have been read.
 
     Raises:
         CTMError: on anything that cannot be used, naming the key or the file.
@@ -55,7 +56,7 @@ def assemble(config: Config, run: Path | None = None, step: int = 0, scene: Any 
     add_others()
     seed = config["seed"]
     photometric = made(Photometric, given.loss)
-    transform, training = color_transform(config, seed)
+    transform = color_transform(config, seed)
     name = name_of(config["backbone"])
     backbone = BACKBONES.get(name)
     shares = name_of(config["appearance"])
@@ -65,19 +66,18 @@ def assemble(config: Config, run: Path | None = None, step: int = 0, scene: Any 
     if run is not None:
         observed = [made(CALLBACKS.get(each), settings) for each, settings in given.callbacks.items()]
         observers = (loggers(config, run, step), observed)
-    scene = load_scene(config) if scene is None else scene
+    scene = load_scene(config, capture) if scene is None else scene
     if not isinstance(scene, backbone.Scene):
         expected = f"a data set that backbone={name} can train on (a {backbone.Scene.__name__})"
         if others := " or ".join(f"backbone={each}" for each in _made_for(scene)):
             expected += f"; this one is for {others}"
         raise ConfigError("dataset", name_of(config["dataset"]), expected)
-    module = backbone(given.backbone, scene, transform.channels, photometric, seed)
+    module = backbone(given.backbone, scene, transform, photometric, seed)
     if given.trainer.minutes is not None and module.pace is None:
         raise ConfigError("trainer.minutes", given.trainer.minutes, f"null: backbone={name} takes all its steps")
-    module.replayed = given.trainer.replay
     if shares != "none":
         module.appearance = APPEARANCES.get(shares)(given.appearance, scene.train)
-    return Parts(scene, module, AttachTransform(transform, training), given.trainer, given.metrics, *observers)
+    return Parts(scene, module, given.trainer, given.metrics, *observers)
 
 
 def _made_for(scene: Any) -> Iterator[str]:
@@ -105,27 +105,28 @@ def loggers(config: Config, run: Path, step: int) -> list[RunLogger]:
         raise ConfigError("logger", name, expected) from error
 
 
-def load_scene(config: Config) -> Any:
-    """Load the data set that a configuration names."""
-    return made(DATASETS.get(name_of(config["dataset"])), section_of(config, "dataset")).load()
+def load_scene(config: Config, capture: Capture | None = None) -> Any:
+    """Load the data set that a configuration names, whose ``capture`` may have been read."""
+    dataset = made(DATASETS.get(name_of(config["dataset"])), section_of(config, "dataset"))
+    return dataset.load() if capture is None else dataset.load(capture)
 
 
-def color_transform(config: Config, seed: int) -> tuple[ColorTransform, TransformTraining]:
-    """Build the fixed space with the learned transform on top of it, and how the latter is trained."""
+def color_transform(config: Config, seed: int) -> ColorTransform:
+    """Build the fixed space with the learned transform on top of it, which knows how it is trained."""
     name = name_of(config["color_space"])
     with seeded(seed):
         space = COLOR_SPACES.get(name)(section_of(config, "color_space"))
     space.label = f"color_space={name}"
     if any(True for _ in space.parameters()):
         raise ConfigError("color_space", name, "one without parameters: a space that learns is a ctm")
-    node, (training, settings) = config["ctm"], transform_of(config)
+    node, (space.learning, settings) = config["ctm"], transform_of(config)
     if name_of(node) == "none":
-        return space, training
+        return space
     with seeded(seed):
         learned = TRANSFORMS.get(name_of(node))(settings)
-    learned.label = f"ctm={node.get('preset', name_of(node))}"
+    learned.label, learned.learning = f"ctm={node.get('preset', name_of(node))}", space.learning
     if name == "rgb":
-        return learned, training
+        return learned
     if space.channels != 3:
         raise ConfigError("color_space", name, f"one of 3 channels under {learned.label}")
-    return Chain(space, learned), training
+    return Chain(space, learned)

@@ -20,24 +20,24 @@ from ctm_plugin.scene.kinds import BACKGROUNDS, GEOMETRIES
 from ctm_plugin.scene.poses import Similarity
 from ctm_plugin.scene.views import Scene, Views
 
-CAMERAS = "cameras.json"
-"""A run's cameras, of training and test views, and what else of its scene is no picture."""
-SAME = ("name", "near", "far", "geometry", "background")
-"""Of a scene, as they are."""
+CAMERAS_FILE = "cameras.json"
+"""Name of a run's file of training and test cameras, with all of its scene that is not a picture."""
+COPIED = ("name", "near", "far", "geometry", "background")
+"""Attributes of a scene that the file holds unchanged."""
 
 
 def note_cameras(run: Path, module: PosedBackbone) -> None:
     """Write down how a run's scene is looked at: cameras, bounds, background, masks and light, but no picture."""
     scene, world = module.scene, module.scene.world
     note = {
-        **{name: getattr(scene, name) for name in SAME},
+        **{name: getattr(scene, name) for name in COPIED},
         "dark": scene.dark,
         # With something that tells pictures apart it hangs on the weights: metrics.json has it in the end.
         "light": astuple(module.light) if module.appearance is None else None,
         "world": world and {**world._asdict(), "turn": world.turn.tolist(), "shift": world.shift.tolist()},
         **{split: _note(getattr(scene, split)) for split in ("train", "test")},
     }
-    write_text(run / CAMERAS, json.dumps(note, allow_nan=False) + "\n")
+    write_text(run / CAMERAS_FILE, json.dumps(note, allow_nan=False) + "\n")
 
 
 def _note(views: Views) -> dict[str, Any]:
@@ -63,9 +63,9 @@ def noted_scene(run: Path) -> Scene | None:
     Raises:
         CheckpointError: what is written down cannot be used.
     """
-    if not (run / CAMERAS).is_file():
+    if not (run / CAMERAS_FILE).is_file():
         return None
-    note = read_json(run / CAMERAS)
+    note = read_json(run / CAMERAS_FILE)
     try:
         light, world = note["light"], note["world"]
         if light is None:
@@ -82,10 +82,10 @@ def noted_scene(run: Path) -> Scene | None:
         _check(0 <= note["near"] < note["far"] < float("inf"), "near")
         _check(note["geometry"] in GEOMETRIES and note["background"] in BACKGROUNDS, "geometry")
         views = {split: _views(note[split], note["dark"]) for split in ("train", "test")}
-        return Scene(**{name: note[name] for name in SAME}, **views, world=world, light=(gain, contrast, saturation))
+        return Scene(**{name: note[name] for name in COPIED}, **views, world=world, light=(gain, contrast, saturation))
     except (KeyError, TypeError, ValueError, RuntimeError, OverflowError) as error:
         found = f"no cameras ({type(error).__name__}: {error})"
-        raise CheckpointError(run / CAMERAS, found, "what a run writes there") from error
+        raise CheckpointError(run / CAMERAS_FILE, found, "what a run writes there") from error
 
 
 def _views(note: Any, dark: Any) -> Views:

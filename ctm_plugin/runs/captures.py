@@ -13,20 +13,20 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from ctm_plugin.data.load import NEAREST
+from ctm_plugin.data.load import NEAR_TARGET
 from ctm_plugin.data.readers.colmap_model import Taken
 from ctm_plugin.data.readers.images import to_8_bits
-from ctm_plugin.data.readers.lens import PINHOLE, Camera
+from ctm_plugin.data.readers.lens import PINHOLE, Intrinsics
 from ctm_plugin.data.write_colmap import write_model
 from ctm_plugin.files import replacing, write_json, write_text
 from ctm_plugin.scene.frustum import projected
-from ctm_plugin.scene.poses import STILL
+from ctm_plugin.scene.poses import IDENTITY
 from ctm_plugin.scene.views import Pixels, Points, Scene, Views, unit
 from ctm_plugin.show.bars import tracked
 from ctm_plugin.show.ply import write_ply
 
-PLY = "sparse_pc.ply"
-"""The points once more, as nerfstudio calls them: it does not look for COLMAP's."""
+POINTS_FILE = "sparse_pc.ply"
+"""File of the points once more, by nerfstudio's name: it does not look for COLMAP's."""
 
 
 class Dots(NamedTuple):
@@ -45,8 +45,8 @@ class Sights(NamedTuple):
     colors: np.ndarray
 
 
-class Shot(NamedTuple):
-    """A view as it is listed.
+class CapturedView(NamedTuple):
+    """A view in COLMAP's or nerfstudio's list.
 
     Attributes:
         file: of its picture, in the folder ``images``.
@@ -58,13 +58,15 @@ class Shot(NamedTuple):
 
     file: str
     testing: bool
-    lens: Camera
+    lens: Intrinsics
     pose: Float[np.ndarray, "3 4"]
     sight: Sights
 
 
 NO_DOTS = Dots(np.empty((0, 3)), np.empty((0, 3)), np.empty((0, 3), np.uint8))
-NOTHING = Sights(np.empty(0, np.int64), np.empty((0, 2)), np.empty((0, 3), np.uint8))
+"""A cloud without points."""
+NO_SIGHTS = Sights(np.empty(0, np.int64), np.empty((0, 2)), np.empty((0, 3), np.uint8))
+"""The observations of a picture that sees no point."""
 
 
 def write_capture(
@@ -92,11 +94,11 @@ def write_capture(
     splits = {"train": scene.train, "test": scene.test}
     twice = not set(scene.train.names).isdisjoint(scene.test.names)
     masked = any(views.mask is not None for views in splits.values())  # nerfstudio wants all masks or none
-    shots: list[Shot] = []
+    shots: list[CapturedView] = []
     for kind in ("images", *(("masks",) if masked else ())):
         (folder / kind).mkdir(parents=True, exist_ok=True)
     for split, views in splits.items():
-        poses = (scene.world or STILL).inverse().of_poses(views.c2w.double().numpy())
+        poses = (scene.world or IDENTITY).inverse().of_poses(views.c2w.double().numpy())
         for index in tracked(range(len(views)), f"{split} views"):
             image = picture(views, index)
             if image is None and not absent:
@@ -109,8 +111,8 @@ def write_capture(
                 mask = torch.ones(views.height, views.width) if views.mask is None else views.mask[index]
                 write_pixels(folder / f"masks/{name}.png", mask[..., None].to(torch.uint8) * 255)
             known = points is not None and split == "train" and image is not None
-            sight = seen(points, views, index, image) if known else NOTHING
-            shots.append(Shot(f"{name}.{kind}", split == "test", lens_of(views, index), poses[index], sight))
+            sight = seen(points, views, index, image) if known else NO_SIGHTS
+            shots.append(CapturedView(f"{name}.{kind}", split == "test", lens_of(views, index), poses[index], sight))
     if dots is None:
         dots, shots = coloured(scene, shots)
     write_sparse(folder / "sparse/0", shots, dots)
@@ -121,12 +123,12 @@ def write_capture(
     lists["val_filenames"] = lists["test_filenames"]  # nerfstudio wants all lists or none, and these while it trains
     content = {"camera_model": "OPENCV", "w": scene.train.width, "h": scene.train.height, **bounds_of(scene), **lists}
     if len(dots.positions):
-        write_ply(folder / PLY, *dots)
-        content["ply_file_path"] = PLY
+        write_ply(folder / POINTS_FILE, *dots)
+        content["ply_file_path"] = POINTS_FILE
     write_json(folder / "transforms.json", {**content, "frames": [frame_of(each, masked) for each in shots]})
 
 
-def write_sparse(folder: Path, shots: Sequence[Shot], dots: Dots) -> None:
+def write_sparse(folder: Path, shots: Sequence[CapturedView], dots: Dots) -> None:
     """Write COLMAP's model of these views and points, and which are for testing."""
     cameras = {lens: number for number, lens in enumerate(dict.fromkeys(each.lens for each in shots), 1)}
     taken = [Taken(each.file, each.pose, cameras[each.lens], each.sight.rows + 1) for each in shots]
@@ -136,18 +138,18 @@ def write_sparse(folder: Path, shots: Sequence[Shot], dots: Dots) -> None:
 
 def bounds_of(scene: Scene) -> dict[str, float]:
     """Near and far in the files' world."""
-    size = (scene.world or STILL).scale
-    near = scene.near if scene.world is None else 1 / (NEAREST * size)  # what becomes NDC's near plane
+    size = (scene.world or IDENTITY).scale
+    near = scene.near if scene.world is None else 1 / (NEAR_TARGET * size)  # what becomes NDC's near plane
     return {"near": near, "far": scene.far / size}
 
 
-def lens_of(views: Views, index: int) -> Camera:
+def lens_of(views: Views, index: int) -> Intrinsics:
     """A view's intrinsics and distortion."""
     distortion = PINHOLE if views.distortion is None else tuple(views.distortion[index].tolist())
-    return Camera(views.width, views.height, *views.intrinsics[index].tolist(), distortion)
+    return Intrinsics(views.width, views.height, *views.intrinsics[index].tolist(), distortion)
 
 
-def frame_of(shot: Shot, masked: bool) -> dict[str, Any]:
+def frame_of(shot: CapturedView, masked: bool) -> dict[str, Any]:
     """A view's entry among the frames."""
     lens, name = shot.lens, Path(shot.file).stem
     numbers = dict(zip(("fl_x", "fl_y", "cx", "cy"), lens.pinhole, strict=True))
@@ -168,7 +170,7 @@ def seen(points: Points, views: Views, index: int, image: Pixels) -> Sights:
     return Sights(rows.numpy(), places.numpy(), to_8_bits(unit(image[y, x, :3])).numpy())
 
 
-def coloured(scene: Scene, shots: Sequence[Shot]) -> tuple[Dots, list[Shot]]:
+def coloured(scene: Scene, shots: Sequence[CapturedView]) -> tuple[Dots, list[CapturedView]]:
     """The reconstruction's points that views see, in the mean of their colours, and the sights of these.
 
     Their normals are 0: nobody tells them.
@@ -180,7 +182,7 @@ def coloured(scene: Scene, shots: Sequence[Shot]) -> tuple[Dots, list[Shot]]:
     if not kept.any():
         return NO_DOTS, list(shots)
     sums = np.stack([np.bincount(rows, channel, count) for channel in colors.T.astype(float)], 1)
-    positions = (scene.world or STILL).inverse().moved(scene.points.positions.double().numpy()[kept])
+    positions = (scene.world or IDENTITY).inverse().moved(scene.points.positions.double().numpy()[kept])
     dots = Dots(positions, np.zeros_like(positions), (sums[kept] / times[kept, None]).round().astype(np.uint8))
     row = np.cumsum(kept) - 1
     return dots, [each._replace(sight=each.sight._replace(rows=row[each.sight.rows])) for each in shots]

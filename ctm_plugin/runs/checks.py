@@ -8,8 +8,8 @@ from typing import Any, NamedTuple, TypeVar
 
 from ctm_plugin.errors import ConfigError
 from ctm_plugin.settings.build import SECTIONS, Config, build, unknown_key
-from ctm_plugin.settings.registry import CALLBACKS, REGISTRIES, SETTINGS, TRAINING, load
-from ctm_plugin.settings.setting import MOST, Nothing
+from ctm_plugin.settings.registry import CALLBACKS, CTM_SETTINGS, PRESET_SETTINGS, REGISTRIES, load
+from ctm_plugin.settings.setting import MAX_INT, Nothing
 
 T = TypeVar("T")
 
@@ -51,7 +51,7 @@ def checked(config: Config, watched: bool = True) -> Checked:
     if config["resume"] is not None:
         raise ConfigError("resume", config["resume"], "null: a run goes on only by resume=RUN_DIR on the command line")
     seed = config["seed"]
-    if not isinstance(seed, int) or isinstance(seed, bool) or not 0 <= seed <= MOST:
+    if not isinstance(seed, int) or isinstance(seed, bool) or not 0 <= seed <= MAX_INT:
         raise ConfigError("seed", seed, "an integer >= 0")
     named = {name: node for name, node in config["callbacks"].items() if node is not None}
     for name, node in named.items():
@@ -73,7 +73,7 @@ def section_of(config: Config, section: str) -> Any:
 
 def transform_of(config: Config) -> tuple[Any, Any]:
     """Build the settings of ``ctm``: how a transform is trained, and its own."""
-    node, common = config["ctm"], load(TRAINING)
+    node, common = config["ctm"], load(CTM_SETTINGS)
     if name_of(node) == "none":
         return common(), build(Nothing, own(node), "ctm")
     shared = [each.name for each in fields(common)]
@@ -84,8 +84,8 @@ def transform_of(config: Config) -> tuple[Any, Any]:
 
 def kind_of(section: str, name: str) -> type:
     """Find the dataclass of a section's settings, under the name of a choice where it has several."""
-    if section in SETTINGS:
-        return load(SETTINGS[section])
+    if section in PRESET_SETTINGS:
+        return load(PRESET_SETTINGS[section])
     return Nothing if name == "none" else REGISTRIES[section].settings(name)
 
 

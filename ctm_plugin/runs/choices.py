@@ -14,11 +14,19 @@ from ctm_plugin.errors import ConfigError, CTMError, DataError
 from ctm_plugin.runs.checks import kind_of
 from ctm_plugin.settings.as_typed import as_typed, bare, is_sweep, values_of
 from ctm_plugin.settings.build import SECTIONS
-from ctm_plugin.settings.registry import CALLBACKS, DATASETS, REGISTRIES, SETTINGS, TRAINING, load
+from ctm_plugin.settings.registry import (
+    CALLBACKS,
+    CTM_SETTINGS,
+    DATASETS,
+    PRESET_SETTINGS,
+    REGISTRIES,
+    conf_dir,
+    load,
+)
 from ctm_plugin.settings.setting import defaults, meanings
 
 GROUPS = (*(section for section in SECTIONS if section != "metrics"), "experiment")
-"""Of choices, by the names that a command line gives them."""
+"""Groups of choices by their names on a command line."""
 
 
 def normalise(arguments: Sequence[str]) -> list[str]:
@@ -48,12 +56,12 @@ def told(group: str, name: str = "") -> dict[str, str]:
 
 def _each(group: str, name: str, what: Callable[[type], dict[str, Any]]) -> dict[str, Any]:
     if group == "callbacks" and not name:
-        found = {each: what(CALLBACKS.settings(each)) for each in CALLBACKS.ours}
-        dotted = {f"{above}.{key}": words for above, inner in found.items() for key, words in inner.items()}
-        return found if what is defaults else dotted
-    if group not in SETTINGS and group not in REGISTRIES:
+        callbacks = {each: what(CALLBACKS.settings(each)) for each in CALLBACKS.ours}
+        dotted = {f"{above}.{key}": words for above, inner in callbacks.items() for key, words in inner.items()}
+        return callbacks if what is defaults else dotted
+    if group not in PRESET_SETTINGS and group not in REGISTRIES:
         return {}
-    return {**what(kind_of(group, name)), **(what(load(TRAINING)) if group == "ctm" and name != "none" else {})}
+    return {**what(kind_of(group, name)), **(what(load(CTM_SETTINGS)) if group == "ctm" and name != "none" else {})}
 
 
 def register(chosen: Iterable[str] | None = None) -> None:
@@ -67,7 +75,7 @@ def register(chosen: Iterable[str] | None = None) -> None:
             yet; ``None``: all have.
     """
     words = None if chosen is None else set(re.findall(r"\w+", " ".join(chosen)))
-    for group in (*SETTINGS, "callbacks"):
+    for group in (*PRESET_SETTINGS, "callbacks"):
         _store("settings", group, node(group))
     for group, registry in REGISTRIES.items():
         stored = ConfigStore.instance().repo.get(group, {})
@@ -85,8 +93,8 @@ def register(chosen: Iterable[str] | None = None) -> None:
                 if not ours:  # ours are one file
                     given = {key: value for key, value in choice.items() if key != "name"}
                     _store(group, name, {"defaults": ["default", "_self_"], name: given})
-            elif group == "ctm" and ours:  # ctm=on and its variants are files
-                _store("settings", name, choice)
+            elif group == "ctm" and (name == group or (conf_dir() / group / f"{name}.yaml").is_file()):
+                _store("settings", name, choice)  # of auto, and of on and its variants, which are files
             else:
                 _store(group, name, choice | ({"preset": name} if group == "ctm" else {}))
 
@@ -98,19 +106,19 @@ def with_usual_backbone(arguments: Sequence[str]) -> list[str]:
     Hydra's defaults could not: of two groups only the later one may say what the other is, and that is a backbone,
     by its ``default_dataset``.
     """
-    found = []
+    arguments_left = []
     for argument in arguments:
         group, _, name = argument.partition("=")
         if group in ("backbone", "experiment"):
             return list(arguments)
-        found.append(argument)
+        arguments_left.append(argument)
         if group == "dataset":
             with suppress(CTMError):  # raised when it is composed
                 (usual, *others) = {
                     getattr(DATASETS.settings(each), "default_backbone", None) for each in name.split(",")
                 }
-                found += [f"backbone={usual}"] if usual and not others else []
-    return found
+                arguments_left += [f"backbone={usual}"] if usual and not others else []
+    return arguments_left
 
 
 def with_fitting_dataset(arguments: Sequence[str]) -> list[str]:
@@ -124,16 +132,16 @@ def with_fitting_dataset(arguments: Sequence[str]) -> list[str]:
     if "dataset.root" not in given or given.keys() & {"dataset", "experiment"}:
         return list(arguments)
     from ctm_plugin.data.readers.folders import require_folder
-    from ctm_plugin.data.readers.layouts import EXPECTED, layouts, way_out
+    from ctm_plugin.data.readers.layouts import LAYOUT_EXPECTED, layouts, way_out
 
     fitting = set()
-    expected = f"a folder that one of dataset={', '.join(EXPECTED)} reads"
+    expected = f"a folder that one of dataset={', '.join(LAYOUT_EXPECTED)} reads"
     values = values_of(given["dataset.root"]) if is_sweep(arguments) else [given["dataset.root"]]
     for name in (name for value in values for name in bare(value)):
         root = require_folder(name, expected)
-        if not (found := layouts(root)):
+        if not (names := layouts(root)):
             raise DataError(root, "no cameras", "; ".join(filter(None, (expected, way_out(root)))))
-        fitting.add(found[0])
+        fitting.add(names[0])
     if len(fitting) > 1:
         raise ConfigError("dataset", "none", f"a sweep each: the folders are for {', '.join(sorted(fitting))}")
     return [f"dataset={fitting.pop()}", *arguments]

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import errno
-from collections.abc import Mapping, Sequence
+import os
+from collections.abc import Iterable, Sequence
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
 import hydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.core.override_parser.types import ChoiceSweep
+from hydra.core.override_parser.types import ChoiceSweep, Override
 from hydra.errors import HydraException, MissingConfigException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
@@ -21,28 +23,22 @@ from ctm_plugin.scene.kinds import AUTO
 from ctm_plugin.settings.as_typed import is_sweep
 from ctm_plugin.settings.build import SECTIONS, unknown_choice, unknown_key
 from ctm_plugin.settings.listing import names
-from ctm_plugin.settings.registry import REGISTRIES
+from ctm_plugin.settings.registry import REGISTRIES, conf_dir
 from ctm_plugin.settings.setting import keys
 
-ROOT = (*SECTIONS, "resume", "seed", "sweep", "hydra")
-"""What stands at the top of a configuration."""
-ELSEWHERE = ("-cd", "-cp", "-cn", "--config-", "hydra.searchpath")
-"""What arguments start with that have Hydra look for choices in other folders too."""
-FULL = ("no room on the disk", "some: make it, then try again; a run goes on by resume=RUN_DIR")
-CLOSED = (
+ROOT_KEYS = (*SECTIONS, "resume", "seed", "sweep", "hydra")
+"""Keys at the top of a configuration."""
+FOLDER_FLAGS = ("-cd", "-cp", "-cn", "--config-", "hydra.searchpath")
+"""Beginnings of arguments that have Hydra look for choices in other folders too."""
+DISK_FULL = ("no room on the disk", "some: make it, then try again; a run goes on by resume=RUN_DIR")
+NO_PERMISSION = (
     "no permission",
     "a place to start in where this user may read and write: hydra.run.dir=FOLDER moves a run, out=PATH a verb's files",
 )
-WAYS_OUT = dict.fromkeys((errno.ENOSPC, errno.EDQUOT, errno.EFBIG), FULL)
-WAYS_OUT |= dict.fromkeys((errno.EACCES, errno.EPERM, errno.EROFS), CLOSED)
+DISK_ERRORS = dict.fromkeys((errno.ENOSPC, errno.EDQUOT, errno.EFBIG), DISK_FULL)
+"""What was found and what is expected by the errno of a failed start."""
+DISK_ERRORS |= dict.fromkeys((errno.EACCES, errno.EPERM, errno.EROFS), NO_PERMISSION)
 """Messages about files that cannot be written, by the system's number."""
-
-
-def conf_dir() -> Path:
-    """Find ``conf/`` inside the package, where a wheel puts it, or next to it, in a checkout."""
-    package = Path(__file__).resolve().parents[1]
-    inside, beside = package / "conf", package.parent / "conf"
-    return inside if inside.is_dir() else beside
 
 
 def compose(*arguments: str) -> dict[str, Any]:
@@ -52,8 +48,12 @@ def compose(*arguments: str) -> dict[str, Any]:
     """
     given = prepared(arguments)
     refuse_several(given)
-    with hydra.initialize_config_dir(str(conf_dir()), version_base="1.3"):
-        return resolved(hydra.compose("config", given), given)
+    from ctm_plugin.runs.decide import decide
+
+    with at_work():
+        config = hydra.compose("config", given)
+    decide(config)
+    return without_hydras(config)
 
 
 def prepared(arguments: Sequence[str]) -> list[str]:
@@ -78,18 +78,28 @@ def check(arguments: Sequence[str]) -> list[str]:
         CTMError, HydraException: there is such a choice, key or value.
     """
     ready = prepared(arguments)
-    if elsewhere(ready):  # only Hydra itself finds what lies there
-        return ready
-    settings = undecided(ready, "bounded")  # the sizes that depend on it are all allowed
-    if not is_sweep(ready):
-        checked(settings)
-        refuse_several(ready)
+    if not elsewhere(ready):  # only Hydra itself finds what lies there
+        with at_work():
+            check_values(composed(ready), ready)
     return ready
+
+
+def check_values(config: DictConfig, arguments: Sequence[str]) -> None:
+    """Refuse keys and values that one run cannot use, and several values where there is no sweep."""
+    settings = without_hydras(config, "bounded")  # the sizes that depend on it are all allowed
+    if not is_sweep(arguments):
+        checked(settings)
+        refuse_several(arguments)
+
+
+def at_work(folder: str | Path | None = None) -> AbstractContextManager[None]:
+    """Hydra, with the choices in this folder, by default our own."""
+    return hydra.initialize_config_dir(os.path.abspath(folder or conf_dir()), "cli", version_base="1.3")
 
 
 def elsewhere(arguments: Sequence[str]) -> bool:
     """Tell whether choices may lie in other folders too."""
-    return any(argument.startswith(ELSEWHERE) for argument in arguments)
+    return any(argument.startswith(FOLDER_FLAGS) for argument in arguments)
 
 
 def refuse_several(arguments: Sequence[str]) -> None:
@@ -98,74 +108,47 @@ def refuse_several(arguments: Sequence[str]) -> None:
     Raises:
         ConfigError: there are some.
     """
-    given = [] if is_sweep(arguments) else [each for each in arguments if "=" in each and not each.startswith("-")]
-    for each in OverridesParser.create().parse_overrides(given):
+    for each in [] if is_sweep(arguments) else parsed(arguments):
         if each.is_sweep_override():
             key, _, value = each.input_line.partition("=")
             a_list = f", {key}=[{value}] is a list" if "," in value else ""
             raise ConfigError(key, value, f"one value; -m before it all makes a run of each{a_list}")
 
 
-def undecided(arguments: Sequence[str], geometry: str = AUTO) -> dict[str, Any]:
+def parsed(arguments: Iterable[str]) -> list[Override]:
+    """Read those of a command line's arguments that are no flags, nor what belongs to a flag."""
+    given = (each for each in arguments if each.startswith("~") or ("=" in each and not each.startswith("-")))
+    return OverridesParser.create().parse_overrides(list(given))
+
+
+def composed(arguments: Sequence[str], name: str = "config", whole: bool = False) -> DictConfig:
     """Compose what a prepared command line comes to before anything is decided; of a sweep, its first run.
 
     Args:
         arguments: see :func:`prepared`.
-        geometry: in place of one that is yet to be found.
+        name: of the file that it starts from.
+        whole: whether Hydra's own part is wanted.
     """
-    given = [argument for argument in arguments if "=" in argument and not argument.startswith(("-", "hydra"))]
     overrides = []
-    for each in OverridesParser.create().parse_overrides(given):
+    for each in parsed(each for each in arguments if whole or not each.startswith("hydra")):
         if each.is_discrete_sweep():
             overrides.append(f"{each.input_line.partition('=')[0]}={next(each.sweep_string_iterator())}")
         elif not each.is_sweep_override():  # others are the sweeper's to refuse
             overrides.append(each.input_line)
-    with hydra.initialize_config_dir(str(conf_dir()), version_base="1.3"):
-        config = hydra.compose("config", overrides)
-        if config.dataset.get("geometry") == AUTO:
-            config.dataset.geometry = geometry
-        return _plain(config)
+    return hydra.compose(name, overrides, return_hydra_config=whole)
 
 
-def _plain(config: DictConfig) -> dict[str, Any]:
-    settings = OmegaConf.to_container(config, resolve=True, throw_on_missing=False)
-    settings.pop("sweep", None)
-    return settings
-
-
-def resolved(config: DictConfig, overrides: Sequence[str], told: bool = True) -> dict[str, Any]:
-    """Resolve the configuration of one run to plain containers, without Hydra's own part and what is a sweep's.
-
-    What it leaves to the program is decided (:func:`ctm_plugin.runs.decide.decide`), and where that is the budget it is
-    composed again, as sizes and steps depend on it.
+def without_hydras(config: DictConfig, geometry: str = AUTO) -> dict[str, Any]:
+    """Resolve a configuration to plain containers, without Hydra's own part and what is a sweep's.
 
     Args:
-        config: as Hydra composed it, which is still at work.
-        overrides: what of.
-        told: whether a line is printed for each decision.
+        config: as Hydra composed it.
+        geometry: in place of one that is yet to be found.
     """
-    from ctm_plugin.runs.decide import decide
-
-    found = decide(config, told)
-    if "trainer" in found:
-        config = hydra.compose("config", _with(overrides, found))
-    elif found:  # all that depends on it is an interpolation
-        config.dataset.geometry = found["dataset.geometry"]
-    return _plain(config)
-
-
-def decided(arguments: Sequence[str]) -> list[str]:
-    """Put in what a command line of one run leaves to the program, see :func:`resolved`."""
-    from ctm_plugin.runs.decide import decide
-
-    overrides = [each for each in arguments if "=" in each and not each.startswith(("-", "hydra"))]
-    with hydra.initialize_config_dir(str(conf_dir()), version_base="1.3"):
-        return _with(arguments, decide(hydra.compose("config", overrides)))
-
-
-def _with(arguments: Sequence[str], found: Mapping[str, str]) -> list[str]:
-    left = (each for each in arguments if each.lstrip("+").partition("=")[0] not in found)
-    return [*left, *(f"{key}={value}" for key, value in found.items())]
+    own = OmegaConf.masked_copy(config, [key for key in config if key not in ("hydra", "sweep")])
+    if own.dataset.get("geometry") == AUTO:
+        own.dataset.geometry = geometry
+    return OmegaConf.to_container(own, resolve=True, throw_on_missing=False)
 
 
 def check_choices(arguments: Sequence[str]) -> None:
@@ -189,8 +172,8 @@ def check_choices(arguments: Sequence[str]) -> None:
             raise ConfigError(key, value, f"a value that can be read ({why})") from error
         group, section = given.key_or_group, given.key_or_group.partition(".")[0]
         several = given.is_sweep_override()
-        if known_here and not {"/", "@"} & set(group) and section not in ROOT and group not in folders:
-            raise unknown_key(section, ROOT, everywhere())
+        if known_here and not {"/", "@"} & set(group) and section not in ROOT_KEYS and group not in folders:
+            raise unknown_key(section, ROOT_KEYS, everywhere())
         if group not in GROUPS or given.is_delete():
             continue
         chosen = (
@@ -204,21 +187,21 @@ def check_choices(arguments: Sequence[str]) -> None:
 
 def everywhere() -> list[str]:
     """List the dotted keys of all of our choices: one of them may be meant by a key that stands in the wrong place."""
-    found = {
+    names = {
         f"{section}.{key}"
         for section, registry in REGISTRIES.items()
         if section != "callbacks"
         for name in registry.ours
         for key in keys(registry.settings(name))
     }
-    return sorted(found)
+    return sorted(names)
 
 
 def explain(error: Exception) -> str:
     """Word an error's message; of Hydra's with the known choices or keys where one is unknown, of files the way out."""
-    if isinstance(error, OSError) and error.filename is not None and error.errno in WAYS_OUT:
-        found, expected = WAYS_OUT[error.errno]
-        return str(DataError(error.filename, f"{found} ({error.strerror})", expected))
+    if isinstance(error, OSError) and error.filename is not None and error.errno in DISK_ERRORS:
+        fault, expected = DISK_ERRORS[error.errno]
+        return str(DataError(error.filename, f"{fault} ({error.strerror})", expected))
     if not isinstance(error, (HydraException, OmegaConfBaseException)):
         return str(error)
     if isinstance(error, MissingConfigException) and error.options and error.missing_cfg_file:

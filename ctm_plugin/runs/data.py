@@ -15,8 +15,8 @@ from ctm_plugin.runs.provenance import fingerprints
 from ctm_plugin.runs.rundir import differences, read_json
 from ctm_plugin.settings.build import Config
 
-DATA = "data.json"
-"""A run's note on its data: their folder, as it is and as it lies from the run, and fingerprints of their parts."""
+DATA_FILE = "data.json"
+"""Name of a run's note on its data: the folder, absolute and relative to the run, and fingerprints of its parts."""
 
 
 def note_data(run: Path, config: Config, scene: Any) -> None:
@@ -26,7 +26,7 @@ def note_data(run: Path, config: Config, scene: Any) -> None:
     if folder is not None:
         home = Path(folder).expanduser().resolve()
         places = {"root": str(home), "from_run": os.path.relpath(home, run.resolve())}
-    write_json(run / DATA, {**places, "parts": fingerprints(scene)})
+    write_json(run / DATA_FILE, {**places, "parts": fingerprints(scene)})
 
 
 def located(config: Config, run: Path, root: str | None = None) -> Config:
@@ -65,7 +65,7 @@ def _places(root: str, run: Path) -> Iterator[str]:
 
 
 def _note(run: Path) -> dict[str, Any]:
-    return read_json(run / DATA) if (run / DATA).is_file() else {}  # none: killed before it was written
+    return read_json(run / DATA_FILE) if (run / DATA_FILE).is_file() else {}  # none: killed before it was written
 
 
 def check_data(run: Path, scene: Any, refuse: bool = False) -> bool:

@@ -10,8 +10,9 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
+from ctm_plugin.data.capture import Capture
+from ctm_plugin.data.load import Layout
 from ctm_plugin.data.rig import Rig
-from ctm_plugin.data.settings import PhotoConfig
 from ctm_plugin.errors import CTMError
 from ctm_plugin.runs.checks import own
 from ctm_plugin.runs.processes import is_main_process
@@ -20,34 +21,35 @@ from ctm_plugin.settings.build import build
 from ctm_plugin.settings.registry import BACKBONES, DATASETS
 
 QUICK_PIXELS = 300**2
-"""Largest picture that the quick budget, whose grids have 64 to 128 voxels a side, is made for."""
+"""Most pixels of a picture that the quick budget suits; its grids have 64 to 128 voxels a side."""
 
 
-def decide(config: DictConfig, told: bool = True) -> dict[str, str]:
-    """Find ``dataset.geometry``, ``trainer`` and, for splats, ``trainer.accelerator`` where they are ``auto``.
+def decide(config: DictConfig) -> Capture | None:
+    """Put in ``dataset.geometry``, ``trainer.budget`` and, for splats, ``trainer.accelerator`` where they are ``auto``.
+
+    A line tells of each, with the reason.
 
     Args:
         config: as Hydra composed it.
-        told: whether a line is printed for each, with the reason.
 
     Returns:
-        What to compose it again with.
+        What was read for it, so that it is not read again.
     """
-    dataset, found = OmegaConf.to_container(config.dataset, resolve=True, throw_on_missing=False), {}
-    rig = _rig(dataset) if AUTO in (dataset.get("geometry"), config.trainer.budget) else None
+    dataset, decided = OmegaConf.to_container(config.dataset, resolve=True, throw_on_missing=False), {}
+    capture, rig = _read(dataset) if AUTO in (dataset.get("geometry"), config.trainer.budget) else (None, None)
     if dataset.get("geometry") == AUTO:
-        found["dataset.geometry"] = ("bounded", "") if rig is None else rig.geometry(_among(config.backbone.name))
+        decided["dataset.geometry"] = ("bounded", "") if rig is None else rig.geometry(_among(config.backbone.name))
     accelerator = config.trainer.accelerator
     if accelerator == AUTO and config.backbone.name == "splat" and has_gpu() and not composites_there():
         accelerator = "cpu"
-        found["trainer.accelerator"] = accelerator, "splats on a GPU need Triton or gsplat, and neither is installed"
+        decided["trainer.accelerator"] = accelerator, "splats on a GPU need Triton, which is not installed"
     if config.trainer.budget == AUTO:
-        found["trainer"] = budget(rig, accelerator)
-    if told and is_main_process():
-        for key, (value, why) in found.items():
-            if why:
-                print(f"{key}={value}: {why}", file=sys.stderr)
-    return {key: value for key, (value, _) in found.items()}
+        decided["trainer.budget"] = budget(rig, accelerator)
+    for key, (value, why) in decided.items():
+        OmegaConf.update(config, key, value)
+        if why and is_main_process():
+            print(f"{key.removesuffix('.budget')}={value}: {why}", file=sys.stderr)
+    return capture
 
 
 def budget(rig: Rig | None, accelerator: str) -> tuple[str, str]:
@@ -68,15 +70,19 @@ def has_gpu() -> bool:
 
 def composites_there() -> bool:
     """Whether a GPU has kernels for splats: by plain torch they are many times slower than by a processor's loops."""
-    return any(find_spec(name) for name in ("triton", "gsplat"))
+    return find_spec("triton") is not None
 
 
-def _rig(dataset: dict[str, Any]) -> Rig | None:
-    with suppress(CTMError):  # raised when the run is built
+def _read(dataset: dict[str, Any]) -> tuple[Capture | None, Rig | None]:
+    """What the files of a data set say, and how its cameras stand; errors are raised when the run is built."""
+    capture = rig = None
+    with suppress(CTMError):
         kind = DATASETS.get(str(dataset.get("name")))
-        if isinstance(kind, type) and issubclass(kind, PhotoConfig):
-            return build(kind, own(dataset), "dataset").rig()  # errors are raised when the data are loaded
-    return None
+        if isinstance(kind, type) and issubclass(kind, Layout):
+            layout = build(kind, own(dataset), "dataset")
+            capture = layout.capture()
+            rig = layout.rig(capture)
+    return capture, rig
 
 
 def _among(backbone: Any) -> Sequence[str]:

@@ -5,45 +5,51 @@ from __future__ import annotations
 import os
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from shutil import which
+from typing import Any
 
+from PIL import Image
 from rich.console import Console
 from rich.table import Table
 
+from ctm_plugin.data.readers.images import to_8_bits
+from ctm_plugin.files import write_text
 from ctm_plugin.metrics.table import Metric, told_at
 from ctm_plugin.runs.compose import compose
 from ctm_plugin.runs.load import load_run
+from ctm_plugin.runs.page import html, picture_url
+from ctm_plugin.runs.rundir import PAGE
 from ctm_plugin.runs.train import train
 from ctm_plugin.scene.views import composite
-from ctm_plugin.show.console import output_console, print_next, table_for
-from ctm_plugin.show.pictures import below, beside, depth_picture, labelled, write_png
+from ctm_plugin.show.console import output_console, print_file, print_next, table_for
+from ctm_plugin.show.pictures import depth_picture
 
-SHOWN = {"off": "no CTM", "quick": "CTM", "auto": "ctm=auto"}
-"""What is trained, and what it is called."""
+DEMO_LABELS = {"off": "no CTM", "quick": "CTM", "auto": "ctm=auto"}
+"""Labels of the transforms that the demo trains."""
 
 
 def demo(others: Sequence[str] = ()) -> None:
     """Train on the dark still life in plain colours, with the paper's CTM and with ``ctm=auto``, minutes on a laptop.
 
-    Prints their scores, and writes side_by_side.png into a folder below runs/.
+    Prints their scores, and writes index.html, where they are side by side, into a folder below runs/.
 
     Args:
         others: choices and keys for all runs.
     """
     folder = Path("runs") / f"demo_{time.strftime('%Y-%m-%d_%H-%M-%S')}"
     console = output_console()
-    configs = {ctm: compose(f"ctm={ctm}", "trainer=quick", *others) for ctm in SHOWN}
+    configs = {ctm: compose(f"ctm={ctm}", "trainer=quick", *others) for ctm in DEMO_LABELS}
     results = {}
     for ctm, config in configs.items():
         console.print(f"\n[bold]ctm={ctm}[/bold]")
         results[ctm] = train(config, folder / f"ctm_{ctm}")
-    picture = folder / "side_by_side.png"
-    side_by_side([folder / f"ctm_{ctm}" for ctm in SHOWN], picture)
+    write_demo({ctm: folder / f"ctm_{ctm}" for ctm in DEMO_LABELS}, results, folder / PAGE)
     console.print(f"{results['off']['dataset']}, {results['off']['steps']} steps", highlight=False)
     console.print(comparison(console, results))
-    console.print(f"picture: {picture}", soft_wrap=True, highlight=False, markup=False)
+    console.print(advice(results), highlight=False, markup=False)
+    print_file("side by side: ", folder / PAGE)
     if which("ctm") is None:
         activate = os.path.relpath(Path(sys.prefix, "bin", "activate"))
         console.print(f"next: source {activate}, then", soft_wrap=True, highlight=False, markup=False)
@@ -53,36 +59,41 @@ def demo(others: Sequence[str] = ()) -> None:
 
 def comparison(console: Console, results: dict[str, dict]) -> Table:
     """A row a run, and what each is above or below the first."""
-    told, table = told_at("demo"), table_for(console)
+    metrics, table = told_at("demo"), table_for(console)
     table.add_column("")
-    for metric in told.values():
+    for metric in metrics.values():
         table.add_column(metric.brief or metric.label, justify="right")
     (first, base), *others = results.items()
     for ctm, row in results.items():
-        table.add_row(SHOWN[ctm], *[_text(row[key], metric) for key, metric in told.items()])
+        table.add_row(DEMO_LABELS[ctm], *[_text(row[key], metric) for key, metric in metrics.items()])
     for ctm, row in others:
-        apart = [None if base[key] is None or row[key] is None else row[key] - base[key] for key in told]
-        differences = [_text(value, told[key], "+") for key, value in zip(told, apart, strict=True)]
-        table.add_row(f"{SHOWN[ctm]} - {SHOWN[first]}", *differences)
+        apart = [None if base[key] is None or row[key] is None else row[key] - base[key] for key in metrics]
+        differences = [_text(value, metrics[key], "+") for key, value in zip(metrics, apart, strict=True)]
+        table.add_row(f"{DEMO_LABELS[ctm]} - {DEMO_LABELS[first]}", *differences)
     return table
 
 
-def side_by_side(runs: Sequence[Path], path: Path, view: int = 3) -> None:
-    """One test view of some runs, lit, and its depth, twice as large; the photograph first."""
-    columns, names = [], ["photograph, lit"]
-    for run in runs:
-        loaded = load_run(run)
-        module, ctm = loaded.module, loaded.config["ctm"]["preset"]
-        names.append(SHOWN.get(ctm, f"ctm={ctm}"))
-        scene = module.scene
+def write_demo(runs: Mapping[str, Path], results: Mapping[str, Mapping[str, Any]], path: Path, view: int = 3) -> None:
+    """One test view of some runs, lit, each under its photograph, and its depth, as a page."""
+    shots = []
+    for ctm, run in runs.items():
+        module = load_run(run).module
+        scene, score = module.scene, results[ctm]["psnr_enhanced"]
         out = {name: value.float().cpu() for name, value in module.render_view(scene.test, view).items()}
-        columns.append([module.light.apply(out["rgb"]), depth_picture(out["depth"], scene.near, scene.far)])
-    target = composite(scene.test.images[view], module.constant_background().cpu())
-    depth, nothing = scene.test.depth, target.new_full(target.shape[:2], scene.far)
-    truth = nothing if depth is None else depth[view].nan_to_num(scene.far)
-    columns.insert(0, [module.light.apply(target), depth_picture(truth, scene.near, scene.far)])
-    larger = [below(*column).repeat_interleave(2, 0).repeat_interleave(2, 1) for column in columns]
-    write_png(path, beside(*[labelled(column, name) for column, name in zip(larger, names, strict=True)], gap=4))
+        taken = composite(scene.test.images[view], module.constant_background().cpu())
+        pictures = {"lit": module.light.apply(out["rgb"]), "taken": taken, "photo": module.light.apply(taken)}
+        pictures["depth"] = depth_picture(out["depth"], scene.near, scene.far)
+        urls = {kind: picture_url(Image.fromarray(to_8_bits(each).numpy())) for kind, each in pictures.items()}
+        shots.append({"name": DEMO_LABELS[ctm], "score": f"brightened PSNR {score:.2f} dB", **urls})
+    size = (scene.test.width, scene.test.height)
+    write_text(path, html("demo", name="In the dark, three times", size=size, told=advice(results), shots=shots))
+
+
+def advice(results: Mapping[str, Mapping[str, Any]]) -> str:
+    """Say which of the runs is closest to the photographs in the light, and whether that is the default."""
+    best = max(results, key=lambda ctm: results[ctm]["psnr_enhanced"])
+    default = "the default" if best == "auto" else "though ctm=auto is the default"
+    return f"Closest to the photographs here: ctm={best}, {default}."
 
 
 def _text(value: float | None, metric: Metric, sign: str = "") -> str:

@@ -24,8 +24,9 @@ from ctm_plugin.show.bars import tracked
 from ctm_plugin.show.console import print_summary
 
 LITTLE_DETAIL = 0.25
-"""The score ``detail`` below which a run warns: four runs that failed had 0.01 at most, eleven others 0.5 at least."""
+"""Score ``detail`` below which a run warns: four runs that failed had 0.01 at most, eleven others 0.5 at least."""
 SHORT_BUDGETS = ("smoke", "check", "quick")
+"""Budgets that are too short for such a warning."""
 
 
 def score(
@@ -38,7 +39,7 @@ def score(
         module, config: the run's.
         folder: to write to.
         lpips: what :func:`ctm_plugin.metrics.lpips_weights.load_lpips` returned.
-        steps, spent: of its training, see :class:`ctm_plugin.runs.load.Run`.
+        steps, spent: of its training, see :class:`ctm_plugin.runs.load.LoadedRun`.
         light: what lit pictures are shown in.
 
     Returns:
@@ -87,16 +88,16 @@ def warn_of_failed_views(scores: Mapping[str, Any], budget: str | None) -> None:
     That is where they show little of the photographs' detail, or where references are known and both PSNR and SSIM
     prefer the photographs.
     """
-    found = []
+    faults = []
     if (detail := scores.get("detail")) is not None and detail < LITTLE_DETAIL:
-        found.append(f"show {detail:.2f} of the real detail of their photographs, expected at least {LITTLE_DETAIL}")
+        faults.append(f"show {detail:.2f} of the real detail of their photographs, expected at least {LITTLE_DETAIL}")
     pairs = [(scores.get(name), scores.get(f"{name}_photo")) for name in ("psnr_lit", "ssim_lit")]
     if all(None not in pair and pair[0] < pair[1] for pair in pairs):
-        found.append("are farther from the references than the photographs in the same light")
-    if found:
+        faults.append("are farther from the references than the photographs in the same light")
+    if faults:
         longer = "trainer=standard; if that does not help, " if budget in SHORT_BUDGETS else ""
         warnings.warn(
-            f"the test views {' and '.join(found)}: try {longer}other cameras (ctm cameras finds them) or another "
+            f"the test views {' and '.join(faults)}: try {longer}other cameras (ctm cameras finds them) or another "
             "dataset.geometry",
             stacklevel=2,
         )
@@ -110,10 +111,10 @@ def evaluate(run: Path, light: LightConfig = AUTO_LIGHT, root: str | None = None
     Raises:
         CTMError: if the folder is no run, or its checkpoint cannot be used.
     """
-    found = load_run(run, root)
-    lpips = lpips_for(found.parts)
+    loaded = load_run(run, root)
+    lpips = lpips_for(loaded.parts)
     (run / "evaluation").mkdir(exist_ok=True)
-    return score(found.module, found.config, run / "evaluation", lpips, found.step, found.spent, light)
+    return score(loaded.module, loaded.config, run / "evaluation", lpips, loaded.step, loaded.spent, light)
 
 
 def command(run: Path, settings: LitConfig) -> None:

@@ -15,24 +15,26 @@ from ctm_plugin.color.light import Light, chosen_light
 from ctm_plugin.cpu.products import fast_products
 from ctm_plugin.data.readers.images import to_8_bits
 from ctm_plugin.errors import ConfigError
-from ctm_plugin.files import replacing
+from ctm_plugin.files import replacing, replacing_folder
 from ctm_plugin.metrics.precision import full_float32
 from ctm_plugin.runs.captures import Dots, write_capture
 from ctm_plugin.runs.load import load_posed
 from ctm_plugin.runs.page import write_page
-from ctm_plugin.runs.rundir import PAGE
+from ctm_plugin.runs.rundir import ALL, PAGE
 from ctm_plugin.runs.settings import ExportConfig
-from ctm_plugin.runs.splats import STEPS, likeness, lit, plain, read_splats, write_splats
+from ctm_plugin.runs.splats import TRAIN_STEPS, likeness, lit_view, plain, read_splats, write_splats
 from ctm_plugin.runs.surface import Surface, cloud, mesh
 from ctm_plugin.runs.video import check_new
-from ctm_plugin.scene.poses import STILL
+from ctm_plugin.scene.poses import IDENTITY
 from ctm_plugin.scene.views import Scene, Views, composite
+from ctm_plugin.show.bars import tracked
 from ctm_plugin.show.console import print_file, print_next
+from ctm_plugin.show.pictures import write_png
 from ctm_plugin.show.ply import write_ply
 from ctm_plugin.splats.gaussians import Gaussians
 
-FOLDERS = ("depth", "cameras", "pictures")
-"""What is more than one file."""
+FOLDER_EXPORTS = ("depth", "cameras", "pictures")
+"""Exports that are more than one file."""
 
 
 def export(run: Path, settings: ExportConfig) -> None:
@@ -70,7 +72,7 @@ def export(run: Path, settings: ExportConfig) -> None:
         raise ConfigError("what", what, f"points or mesh: a {type(module).__name__} has no Gaussians")
     if what == "mesh" and splats:
         raise ConfigError("what", what, "points or splats: a mesh needs a run of backbone=dvgo, ngp or nerf")
-    place = out / ("photographs" if settings.photographs else what if what in FOLDERS else f"{what}.ply")
+    place = out / ("photographs" if settings.photographs else what if what in FOLDER_EXPORTS else f"{what}.ply")
     if not settings.overwrite:
         there = place.rglob("*") if place.is_dir() else [place]
         check_new(sorted(path for path in there if path.is_file()))
@@ -98,9 +100,19 @@ def export_page(run: Path, path: Path, settings: ExportConfig) -> None:
     write_page(path, run, posed, chosen_light(settings, posed.light))
 
 
+def write_views(run: Path) -> None:
+    """Write every photograph's view, lit: ``all/NAME.png``."""
+    posed = load_posed(run, pictures=False)
+    module, scene = posed.module, posed.module.scene
+    every = [(views, index) for views in (scene.train, scene.test) for index in range(len(views))]
+    with replacing_folder(run / ALL) as folder, fast_products(module.device):
+        for views, index in tracked(every, ALL):
+            write_png(folder / f"{views.names[index]}.png", lit_view(module, views, index, posed.light))
+
+
 def write_lit(path: Path, module: Splat, light: Light) -> None:
     """Write a run's Gaussians, their colours lit, and tell how close the file is to the run."""
-    gaussians = plain(module, light, STEPS)
+    gaussians = plain(module, light, TRAIN_STEPS)
     path.parent.mkdir(parents=True, exist_ok=True)
     write_splats(path, gaussians)
     back = Gaussians(*(table.to(module.device) for table in read_splats(path)))
@@ -115,14 +127,14 @@ def write_surface(path: Path, surface: Surface, scene: Scene, light: Light) -> N
 
 def dots_of(surface: Surface, scene: Scene, light: Light) -> Dots:
     """A surface's points in the files' world, their colours lit."""
-    back = (scene.world or STILL).inverse()
+    back = (scene.world or IDENTITY).inverse()
     points, normals = back.moved(surface.points.double().numpy()), surface.normals.double().numpy() @ back.turn.T
     return Dots(points, normals, to_8_bits(light.apply(surface.colors)).numpy())
 
 
 def write_depths(folder: Path, module: PosedBackbone) -> None:
     """Write distances along the rays of the test views, ``[H, W]`` float32 as ``NAME.npy``."""
-    views, size = module.scene.test, (module.scene.world or STILL).scale
+    views, size = module.scene.test, (module.scene.world or IDENTITY).scale
     folder.mkdir(parents=True, exist_ok=True)
     for index, name in enumerate(views.names):
         with full_float32(module.device):
@@ -145,7 +157,7 @@ def write_pictures(folder: Path, module: PosedBackbone, light: Light, settings: 
     scene, behind = module.scene, module.constant_background().cpu()
 
     def rendered(views: Views, index: int) -> UInt8[Tensor, "h w 3"]:
-        return to_8_bits(lit(module, views, index, light).cpu())
+        return to_8_bits(lit_view(module, views, index, light).cpu())
 
     def photographed(views: Views, index: int) -> UInt8[Tensor, "h w 3"] | None:
         there = views.pictured is None or views.pictured[index]

@@ -25,21 +25,22 @@ from ctm_plugin.errors import CheckpointError, CTMError
 from ctm_plugin.files import check_zip
 from ctm_plugin.metrics.precision import full_float32
 from ctm_plugin.runs.assemble import Parts, assemble
-from ctm_plugin.runs.cameras import CAMERAS, noted_scene
+from ctm_plugin.runs.cameras import CAMERAS_FILE, noted_scene
 from ctm_plugin.runs.data import check_data, located, note_data
-from ctm_plugin.runs.rundir import CONFIG, DAMAGED, LAST, PREVIOUS, differences, load_config, locked, nodes
-from ctm_plugin.runs.splats import STEPS, plain
-from ctm_plugin.scene.poses import STILL
+from ctm_plugin.runs.rundir import CONFIG, DAMAGED, LAST, PREVIOUS, differences, load_config, locked
+from ctm_plugin.runs.splats import TRAIN_STEPS, plain
+from ctm_plugin.scene.poses import IDENTITY
 from ctm_plugin.scene.views import Views
 from ctm_plugin.settings.build import Config
 from ctm_plugin.show.pictures import depth_picture, latent_picture
 from ctm_plugin.splats.gaussians import Gaussians
 
-KINDS = ("lit", "rgb", "latent", "depth")
+VIEW_KINDS = ("lit", "rgb", "latent", "depth")
+"""Kinds of pictures that a view is rendered as."""
 
 
 @dataclass(frozen=True)
-class Run:
+class LoadedRun:
     """A run as it was at its last checkpoint.
 
     Attributes:
@@ -74,12 +75,12 @@ class Run:
                 along -z.
             intrinsics: fx, fy, cx, cy in pixels; the first pixel's centre is at 0.5.
             width, height: in pixels.
-            kind: one of :data:`KINDS`.
+            kind: one of :data:`VIEW_KINDS`.
 
         Returns:
             sRGB in [0, 1], or what depths and latents look like.
         """
-        pose = (self.module.scene.world or STILL).of_poses(np.asarray(c2w, dtype=np.float64)[None, :3])
+        pose = (self.module.scene.world or IDENTITY).of_poses(np.asarray(c2w, dtype=np.float64)[None, :3])
         views = Views(
             torch.zeros(1, height, width, 3, dtype=torch.uint8), torch.from_numpy(pose).float(),
             torch.tensor([intrinsics], dtype=torch.float32), ("view",),
@@ -96,10 +97,10 @@ class Run:
         """
         if not isinstance(self.module, Splat):
             raise CTMError(f"found a run of {type(self.module).__name__}, expected one of splats")
-        return plain(self.module, self.light, STEPS)
+        return plain(self.module, self.light, TRAIN_STEPS)
 
     def picture(self, view: dict[str, Tensor], kind: str, light: Light | None = None) -> Float[Tensor, "h w 3"]:
-        """One of :data:`KINDS` out of what :meth:`PosedBackbone.render_view` returned, on the CPU.
+        """One of :data:`VIEW_KINDS` out of what :meth:`PosedBackbone.render_view` returned, on the CPU.
 
         ``light`` is what lit pictures are shown in; the scene's own where it is ``None``.
         """
@@ -110,7 +111,7 @@ class Run:
         return (light or self.light).apply(view["rgb"]) if kind == "lit" else view["rgb"]
 
 
-def load_run(run: Path, root: str | None = None, pictures: bool = True, scene: Any = None) -> Run:
+def load_run(run: Path, root: str | None = None, pictures: bool = True, scene: Any = None) -> LoadedRun:
     """Read a run again, as it was at its last checkpoint.
 
     Args:
@@ -131,7 +132,7 @@ def load_run(run: Path, root: str | None = None, pictures: bool = True, scene: A
         scene = None if pictures else noted_scene(run)
         if scene is None:
             raise
-        warnings.warn(f"{run}: its photographs are gone; it goes by the cameras in {CAMERAS}", stacklevel=2)
+        warnings.warn(f"{run}: its photographs are gone; it goes by the cameras in {CAMERAS_FILE}", stacklevel=2)
     parts = assemble(config, scene=scene)
     if scene is None and check_data(run, parts.scene) and root is not None:
         with suppress(OSError):  # a run that may only be read
@@ -139,20 +140,20 @@ def load_run(run: Path, root: str | None = None, pictures: bool = True, scene: A
     restore(parts, checkpoint, run / LAST)
     parts.backbone.to("cuda" if torch.cuda.is_available() and parts.trainer.accelerator != "cpu" else "cpu")
     # The rest of the checkpoint, weights and moments, would be held as long.
-    return Run(parts, config, checkpoint["global_step"], checkpoint["callbacks"]["Stopwatch"])
+    return LoadedRun(parts, config, checkpoint["global_step"], checkpoint["callbacks"]["Stopwatch"])
 
 
-def load_posed(run: Path, root: str | None = None, pictures: bool = True, scene: Any = None) -> Run:
+def load_posed(run: Path, root: str | None = None, pictures: bool = True, scene: Any = None) -> LoadedRun:
     """Read a run of a scene with cameras, ready to render; see :func:`load_run`.
 
     Raises:
         CTMError: the folder is no run, its checkpoint cannot be used, or it is not of a scene with cameras.
     """
-    found = load_run(run, root, pictures, scene)
-    if not found.module.posed:
+    loaded = load_run(run, root, pictures, scene)
+    if not loaded.module.posed:
         raise CTMError(f"{run}: found a run of another kind, expected one of a scene that cameras look at")
-    found.module.eval()
-    return found
+    loaded.module.eval()
+    return loaded
 
 
 def restore(parts: Parts, checkpoint: dict[str, Any], path: Path) -> None:
@@ -162,7 +163,6 @@ def restore(parts: Parts, checkpoint: dict[str, Any], path: Path) -> None:
         CheckpointError: they do not fit, as when another version of a backbone made them.
     """
     module = parts.backbone
-    module.transform = parts.attach.transform
     try:
         module.on_load_checkpoint(checkpoint)
         module.load_state_dict(checkpoint["state_dict"])
@@ -192,10 +192,6 @@ def load_checkpoint(run: Path, config: Config, name: str = LAST) -> dict[str, An
         offer = f"; the one before it: python -m ctm_plugin resume={before}" if (run / PREVIOUS).is_file() else ""
         found = f"an unreadable file ({type(error).__name__})"
         raise CheckpointError(path, found, f"a checkpoint{offer if name == LAST else ''}") from error
-    for value, key in nodes(checkpoint):
-        if isinstance(value, Tensor) and not _is_whole(value):
-            found = f"a tensor {list(value.shape)} that is not stored whole, {key}"
-            raise CheckpointError(path, found, "one that is")
     if not _is_checkpoint(checkpoint):
         raise CheckpointError(path, "a file of another kind", "a checkpoint of ctm_plugin")
     # Where the data lie may change, see ctm_plugin.runs.data.
@@ -204,11 +200,6 @@ def load_checkpoint(run: Path, config: Config, name: str = LAST) -> dict[str, An
         found = f"another configuration (differs in {', '.join(differing)})"
         raise CheckpointError(path, found, f"that of {run / CONFIG}")
     return checkpoint
-
-
-def _is_whole(tensor: Tensor) -> bool:
-    """Whether a tensor is no larger than what is stored of it: a small file would fill the memory."""
-    return tensor.layout == torch.strided and tensor.nbytes <= tensor.untyped_storage().nbytes()
 
 
 def _is_checkpoint(content: Any) -> bool:

@@ -26,46 +26,46 @@ from ctm_plugin.cpu.products import fast_products
 from ctm_plugin.data.readers.images import to_8_bits
 from ctm_plugin.files import write_text
 from ctm_plugin.runs.evaluate import LITTLE_DETAIL
-from ctm_plugin.runs.load import Run
+from ctm_plugin.runs.load import LoadedRun
 from ctm_plugin.runs.rundir import METRICS, film_of, read_json
-from ctm_plugin.runs.splats import LOOKS, cameras_in_files, lit, plain
+from ctm_plugin.runs.splats import MAX_CAMERAS, cameras_in_files, lit_view, plain
 from ctm_plugin.runs.video import encoded
-from ctm_plugin.scene.poses import STILL
+from ctm_plugin.scene.poses import IDENTITY
 from ctm_plugin.show.bars import tracked
 from ctm_plugin.show.walk import Spots, Start, walk
 from ctm_plugin.splats.gaussians import Camera, Gaussians, rotations
 from ctm_plugin.splats.seen import as_wide_as_pixels, pixels_made, times_seen
-from ctm_plugin.splats.start import HARMONIC
+from ctm_plugin.splats.start import SH_C0
 
-MOST = 10_000_000
-"""Bytes of a page: mail takes them."""
-MOST_OF_FILM = MOST_OF_PICTURES = 2_500_000
+LIMIT = 10_000_000
+"""Most bytes of a page: mail takes them."""
+MAX_FILM_BYTES = MAX_PICTURE_BYTES = 2_500_000
 """Bytes of these before they are written as text, which makes four of three."""
-VIEWS, WIDTH, QUALITY = 12, 1280, 80
-"""Test views at most, their width in pixels at most, and WebP's quality."""
-SMALLER = 0.8
-"""What widths are multiplied by until all fits."""
-STEPS, LOOKED = 100, 400
-"""Of the training of colours, and the pixels that a row of its pictures has: 42.4 dB from a run's pictures, of 44.9
-after six times as many steps (LOM's bike, 370 pixels wide)."""
-HARDLY = 0.01
-"""Pixels of a mean picture: Gaussians that make fewer are left out, as nobody saw what they are."""
-BYTES = 40
-"""Of a Gaussian in the page, and of the viewer without any."""
-VIEWER = 1_100_000
+MAX_VIEWS, MAX_WIDTH, QUALITY = 12, 1280, 80
+"""Most test views, their largest width in pixels, and WebP's quality."""
+SHRINK = 0.8
+"""Factor on widths, repeated until all fits."""
+COLOR_STEPS, COLOR_WIDTH = 100, 400
+"""Steps of the training of colours, and the width in pixels of its pictures: 42.4 dB from a run's pictures, 44.9 after
+six times as many steps (LOM's bike, 370 pixels wide)."""
+MIN_CONTRIBUTION = 0.01
+"""Least number of pixels of a mean picture that a Gaussian makes; the cameras hardly saw others."""
+GAUSSIAN_BYTES = 40
+"""Bytes of a Gaussian in the page, and of the viewer without any."""
+VIEWER_BYTES = 1_100_000
 WITHOUT_VIEWER = "To walk through the scene, the page needs viser when it is made: pip install -e '.[view]'"
 
 
-class Shot(NamedTuple):
+class PageView(NamedTuple):
     """A test view as data URLs: lit; the photograph as it was, and in the same light, where there is one."""
 
     name: str
-    lit: str
+    lit_view: str
     taken: str | None
     photo: str | None
 
 
-def write_page(path: Path, run: Path, posed: Run, light: Light) -> None:
+def write_page(path: Path, run: Path, posed: LoadedRun, light: Light) -> None:
     """Write a run as a page that opens from a file, loads nothing, and has less than ten million bytes.
 
     It shows the film that the run has, test views next to their photographs, and of splats the scene to walk through.
@@ -76,7 +76,7 @@ def write_page(path: Path, run: Path, posed: Run, light: Light) -> None:
     with fast_products(module.device):
         shots, size = shots_of(module, light)
         parts = {"shots": shots, "size": size, "film": film and film_url(film), "walk": None, "why": ""}
-        room = MOST - len(page(run, posed, light, scores, parts).encode())
+        room = LIMIT - len(page(run, posed, light, scores, parts).encode())
         if not isinstance(module, Splat):
             name = posed.config["backbone"]["name"]
             parts["why"] = f"This scene is of {name}, not of splats, so there is none to walk through."
@@ -91,63 +91,68 @@ def write_page(path: Path, run: Path, posed: Run, light: Light) -> None:
     write_text(path, page(run, posed, light, scores, parts))
 
 
-def page(run: Path, posed: Run, light: Light, scores: Mapping[str, Any], parts: Mapping[str, Any]) -> str:
-    """HTML that needs nothing else; names are escaped."""
-    environment = Environment(loader=PackageLoader("ctm_plugin.runs", "."), autoescape=True)
-    environment.policies["json.dumps_kwargs"] = {"ensure_ascii": False}
-    return environment.get_template("page.html.jinja").render(
+def page(run: Path, posed: LoadedRun, light: Light, scores: Mapping[str, Any], parts: Mapping[str, Any]) -> str:
+    """A run as HTML that needs nothing else."""
+    return html(
+        "page",
         name=posed.module.scene.name,
         dark=light != AS_IS,
         facts=facts(posed, light, scores),
         run=shlex.quote(os.path.relpath(run)),
-        version=__version__,
         **parts,
     )
 
 
-def facts(posed: Run, light: Light, scores: Mapping[str, Any]) -> list[str]:
+def html(kind: str, **values: Any) -> str:
+    """A page of a kind with its values, names escaped."""
+    environment = Environment(loader=PackageLoader("ctm_plugin.runs", "."), autoescape=True)
+    environment.policies["json.dumps_kwargs"] = {"ensure_ascii": False}
+    return environment.get_template(f"{kind}.html.jinja").render(version=__version__, **values)
+
+
+def facts(posed: LoadedRun, light: Light, scores: Mapping[str, Any]) -> list[str]:
     """What was chosen, and how good it is, in plain words."""
     scene, config = posed.module.scene, posed.config
     known, kept = len(scene.train), len(scene.test)
-    found = [f"The scene was learned from {known} photographs. {kept} places were held back, to test it."]
+    sentences = [f"The scene was learned from {known} photographs. {kept} places were held back, to test it."]
     if light != AS_IS:
         why = ", set automatically" if light == posed.light else ""
         stops = f"{math.log2(light.gain):+.1f} stops"
-        found.append(f"It is shown {light.gain:.3g} times as bright as it was ({stops}){why}.")
+        sentences.append(f"It is shown {light.gain:.3g} times as bright as it was ({stops}){why}.")
     detail = scores.get("detail")
     if detail is not None:
         share = f"{detail:.0%} of the fine detail of the photographs, whose grain is not counted"
-        found.append(f"The views show {share}{'' if detail >= LITTLE_DETAIL else ': something went wrong'}.")
+        sentences.append(f"The views show {share}{'' if detail >= LITTLE_DETAIL else ': something went wrong'}.")
     minutes = posed.spent["seconds"] / 60
     spots = f"{len(posed.module.gaussians.means):,} spots of colour" if isinstance(posed.module, Splat) else ""
     how = f"It took {minutes:.0f} minutes" if minutes >= 1.5 else f"It took {posed.spent['seconds']:.0f} seconds"
     what = f", for {spots}" if spots else f", by {config['backbone']['name']}"
-    found.append(f"{how}{what}, on pictures {scene.train.width} pixels wide.")
-    return found
+    sentences.append(f"{how}{what}, on pictures {scene.train.width} pixels wide.")
+    return sentences
 
 
-def shots_of(module: PosedBackbone, light: Light) -> tuple[list[Shot], tuple[int, int]]:
+def shots_of(module: PosedBackbone, light: Light) -> tuple[list[PageView], tuple[int, int]]:
     """The test views, evenly chosen, rendered and photographed, as large as there is room for; width and height."""
-    views, photographs = module.scene.test, module.targets()
-    chosen = np.unique(np.linspace(0, len(views) - 1, min(VIEWS, len(views))).round().astype(int)).tolist()
+    views = module.scene.test
+    chosen = np.unique(np.linspace(0, len(views) - 1, min(MAX_VIEWS, len(views))).round().astype(int)).tolist()
     if len(chosen) < len(views):
         print(f"the page shows {len(chosen)} of {len(views)} test views")
     pictures = []
     for index in tracked(chosen, "page"):
-        photograph = photographs[index]
-        kinds = [lit(module, views, index, light).cpu()]
+        photograph = module.target(index)
+        kinds = [lit_view(module, views, index, light).cpu()]
         kinds += [] if photograph is None else [photograph, light.apply(photograph)]
         pictures.append([Image.fromarray(to_8_bits(each).numpy()) for each in kinds])
-    width = min(WIDTH, views.width)
+    width = min(MAX_WIDTH, views.width)
     while True:
         files = [[webp(each, width) for each in kinds] for kinds in pictures]
-        if sum(len(each) for kinds in files for each in kinds) <= MOST_OF_PICTURES:
+        if sum(len(each) for kinds in files for each in kinds) <= MAX_PICTURE_BYTES:
             break
-        width = int(SMALLER * width)
+        width = int(SHRINK * width)
     if width < views.width:
-        print(f"the page's pictures are {width} pixels wide, of {views.width}: it is to have less than {MOST:,} bytes")
+        print(f"the page's pictures are {width} pixels wide, of {views.width}: it is to have less than {LIMIT:,} bytes")
     shots = [
-        Shot(views.names[index], *[url("image/webp", each) for each in kinds], *[None] * (3 - len(kinds)))
+        PageView(views.names[index], *[url("image/webp", each) for each in kinds], *[None] * (3 - len(kinds)))
         for index, kinds in zip(chosen, files, strict=True)
     ]
     return shots, (width, round(width * views.height / views.width))
@@ -162,6 +167,11 @@ def webp(picture: Image.Image, width: int) -> bytes:
     return out.getvalue()
 
 
+def picture_url(picture: Image.Image) -> str:
+    """A picture as a data URL, as large as it is."""
+    return url("image/webp", webp(picture, picture.width))
+
+
 def url(kind: str, content: bytes) -> str:
     """A file as a data URL."""
     return f"data:{kind};base64,{base64.b64encode(content).decode()}"
@@ -170,14 +180,14 @@ def url(kind: str, content: bytes) -> str:
 def film_url(film: Path) -> str:
     """A film as a data URL; a GIF as WebP; smaller where it has too many bytes."""
     content, ending = film.read_bytes(), ".mp4" if film.suffix == ".mp4" else ".webp"
-    if film.suffix != ending or len(content) > MOST_OF_FILM:
+    if film.suffix != ending or len(content) > MAX_FILM_BYTES:
         frames = iio.imread(film, index=None if film.suffix == ".mp4" else ...)
         about = iio.immeta(film)
         fps = about["fps"] if "fps" in about else 1000 / about["duration"]
         width = frames.shape[2]
         content = encoded(frames, ending, fps)
-        while len(content) > MOST_OF_FILM:
-            width = int(SMALLER * width) // 2 * 2  # even sides, as video wants them
+        while len(content) > MAX_FILM_BYTES:
+            width = int(SHRINK * width) // 2 * 2  # even sides, as video wants them
             small = [Image.fromarray(frame) for frame in frames]
             size = (width, round(width * frames.shape[1] / frames.shape[2] / 2) * 2)
             content = encoded(np.stack([np.asarray(each.resize(size)) for each in small]), ending, fps)
@@ -194,24 +204,24 @@ def walk_of(module: Splat, light: Light, room: int) -> str:
         light: for its colours.
         room: bytes that the viewer may have in the page.
     """
-    scene, every = module.scene, math.ceil(module.scene.train.width / LOOKED)
-    found, cameras = plain(module, light, STEPS, False, every), cameras_in_files(module, scene.train, every)
-    made = pixels_made(found, cameras[:: math.ceil(len(cameras) / LOOKS)]) * every**2
-    made = made * (times_seen(found.means, cameras) >= 2)
-    order, seen = made.argsort(descending=True), int((made >= HARDLY).sum())
-    count = max(min(seen, (room - VIEWER) // BYTES), 1)
+    scene, every = module.scene, math.ceil(module.scene.train.width / COLOR_WIDTH)
+    gaussians, cameras = plain(module, light, COLOR_STEPS, False, every), cameras_in_files(module, scene.train, every)
+    made = pixels_made(gaussians, cameras[:: math.ceil(len(cameras) / MAX_CAMERAS)]) * every**2
+    made = made * (times_seen(gaussians.means, cameras) >= 2)
+    order, seen = made.argsort(descending=True), int((made >= MIN_CONTRIBUTION).sum())
+    count = max(min(seen, (room - VIEWER_BYTES) // GAUSSIAN_BYTES), 1)
     if count < seen:
-        print(f"the page's walk has {count:,} of {seen:,} spots: it is to have less than {MOST:,} bytes")
-    found = as_wide_as_pixels(found, cameras_in_files(module, scene.train))
-    return walk(spots_of(Gaussians(*(table[order[:count]] for table in found))), start_of(module, cameras))
+        print(f"the page's walk has {count:,} of {seen:,} spots: it is to have less than {LIMIT:,} bytes")
+    gaussians = as_wide_as_pixels(gaussians, cameras_in_files(module, scene.train))
+    return walk(spots_of(Gaussians(*(table[order[:count]] for table in gaussians))), start_of(module, cameras))
 
 
 def spots_of(gaussians: Gaussians) -> Spots:
     """Gaussians of three channels, with one colour each, as numbers."""
-    axes = rotations(gaussians.turns) * gaussians.scales.exp()[:, None]
-    colors = (0.5 + HARMONIC * gaussians.base).clamp(0, 1)
-    found = gaussians.means, axes, colors, gaussians.opacities.sigmoid()
-    return Spots(*(each.detach().double().cpu().numpy() for each in found))
+    axes = rotations(gaussians.quats) * gaussians.scales.exp()[:, None]
+    colors = (0.5 + SH_C0 * gaussians.sh0).clamp(0, 1)
+    tables = gaussians.means, axes, colors, gaussians.opacities.sigmoid()
+    return Spots(*(each.detach().double().cpu().numpy() for each in tables))
 
 
 def start_of(module: Splat, cameras: Sequence[Camera]) -> Start:
@@ -219,10 +229,10 @@ def start_of(module: Splat, cameras: Sequence[Camera]) -> Start:
 
     Up is what is up in the mean photograph.
     """
-    views, back = module.scene.train, (module.scene.world or STILL).inverse()
+    views, back = module.scene.train, (module.scene.world or IDENTITY).inverse()
     centres = torch.stack([camera.centre for camera in cameras])
     middle = int((centres - centres.mean(0)).norm(dim=1).argmin())
-    depth = module.render_view(views, middle, math.ceil(views.width / LOOKED))["depth"]
+    depth = module.render_view(views, middle, math.ceil(views.width / COLOR_WIDTH))["depth"]
     high, wide = (side // 3 for side in depth.shape)
     away = back.scale * depth[high : 2 * high, wide : 2 * wide].median()
     camera, up = cameras[middle], -torch.stack([each.turn[1] for each in cameras]).mean(0)

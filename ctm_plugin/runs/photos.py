@@ -9,25 +9,26 @@ from pathlib import Path
 from ctm_plugin.cameras.clips import root_of, take_frames
 from ctm_plugin.cameras.photographs import added, below, home_of, list_photographs
 from ctm_plugin.cameras.raws import develop_raws
-from ctm_plugin.cameras.settings import USUAL, CamerasConfig
+from ctm_plugin.cameras.settings import DEFAULT_FOLDER, CamerasConfig
 from ctm_plugin.data.readers.folders import is_picture, require_folder
 from ctm_plugin.data.readers.images import read_picture
 from ctm_plugin.data.readers.layouts import layouts
 from ctm_plugin.errors import CheckpointError, ConfigError
 from ctm_plugin.runs.compose import compose
 from ctm_plugin.runs.decide import composites_there, has_gpu
-from ctm_plugin.runs.rundir import CONFIG, METRICS, PAGE, film_of, load_config
+from ctm_plugin.runs.rundir import ALL, CONFIG, METRICS, PAGE, film_of, load_config
 from ctm_plugin.runs.settings import ExportConfig, PhotosConfig, VideoConfig
 from ctm_plugin.settings.build import build
 from ctm_plugin.settings.registry import DATASETS
 from ctm_plugin.show.bars import whole
 
 RUNS = Path("runs")
-TIMED = "splat"
-"""The backbone whose schedule may be stretched and cut."""
-STEPS = {"trainer", "trainer.minutes", "backbone.steps"}
-"""Keys that say themselves how long it takes."""
-FEW = 2
+"""Folder of the runs."""
+TIMED_BACKBONE = "splat"
+"""The backbone whose schedule follows the clock."""
+LENGTH_KEYS = {"trainer", "trainer.minutes", "backbone.steps"}
+"""Keys that set the length of a training."""
+TIMED_PHOTOGRAPHS = 2
 """Photographs on which steps are timed."""
 
 
@@ -52,16 +53,16 @@ def photos(folder: Path, settings: PhotosConfig, others: Sequence[str] = ()) -> 
         require_folder(folder, "a folder with photographs or clips, or a clip")
     run = run_folder(root, settings.again)
     check_writable(run)
-    more = [] if (run / CONFIG).exists() or not root.is_dir() else added(root, USUAL)
+    more = [] if (run / CONFIG).exists() or not root.is_dir() else added(root, DEFAULT_FOLDER)
     searching = bool(more) or not (layouts(root) or (run / METRICS).exists())
     if searching:
-        take_frames(folder, USUAL)
+        take_frames(folder, DEFAULT_FOLDER)
         develop_raws(root)
-        for path in list_photographs(root, USUAL):
+        for path in list_photographs(root, DEFAULT_FOLDER):
             read_picture(path)
     # These take seconds to import: what lies in the folder is refused before.
     from ctm_plugin.cameras.command import place, tell
-    from ctm_plugin.runs.export import export_page
+    from ctm_plugin.runs.export import export_page, write_views
     from ctm_plugin.runs.train import resume, train
     from ctm_plugin.runs.video import film
     from ctm_plugin.show.console import output_console, print_file, print_next
@@ -85,9 +86,11 @@ def photos(folder: Path, settings: PhotosConfig, others: Sequence[str] = ()) -> 
         elif not (run / METRICS).exists():
             resume(run, lambda *_: None)
         video = film_of(run) or film(run, VideoConfig())
+        if not (run / ALL).exists():
+            write_views(run)
         if not (run / PAGE).exists():
             export_page(run, run / PAGE, ExportConfig(what="page"))
-    say(f"lit views: {run / 'lit'}\nfilm:      {video}\nscores:    {run / METRICS}")
+    say(f"lit views: {run / ALL}\nfilm:      {video}\nscores:    {run / METRICS}")
     print_file("all of it: ", run / PAGE)
     print_next("view", run)
 
@@ -108,10 +111,18 @@ def check_writable(run: Path) -> None:
 
 def parts(root: Path, seconds: float) -> dict[str, float]:
     """Guess how many seconds each part takes, for the bar over all of them."""
-    count = sum(map(is_picture, below(home_of(root, USUAL))))
+    count = sum(map(is_picture, below(home_of(root, DEFAULT_FOLDER))))
     finding = {} if layouts(root) else {"brightness": 0.1, "details": 0.5, "pairs": 0.5, "placed": 0.4}
-    found = {what: count * each for what, each in finding.items()}
-    return {**found, "training": seconds, "test views": 0.05 * count, "film": 15.0, "colours": 20.0, "page": 5.0}
+    times = {what: count * each for what, each in finding.items()}
+    return {
+        **times,
+        "training": seconds,
+        "test views": 0.05 * count,
+        "film": 15.0,
+        ALL: 0.3 * count,
+        "colours": 20.0,
+        "page": 5.0,
+    }
 
 
 def run_folder(root: Path, again: bool) -> Path:
@@ -134,7 +145,7 @@ def choices(root: Path, minutes: float, others: Sequence[str], say: Callable[[st
 
     from ctm_plugin.cameras.exposures import UNEVEN, spread_of_gains
     from ctm_plugin.runs.assemble import assemble
-    from ctm_plugin.runs.plan import REFERENCE, TRIED, plan, timed_steps
+    from ctm_plugin.runs.plan import REFERENCE, TIMED_COLUMNS, plan, timed_steps
 
     layout = layouts(root)[0]
     chosen = {"dataset": layout, "dataset.root": root.resolve(), "ctm": "auto"}
@@ -147,22 +158,22 @@ def choices(root: Path, minutes: float, others: Sequence[str], say: Callable[[st
     rig = build(DATASETS.get(layout), dataset, "dataset").rig()
     chosen["dataset.geometry"] = dataset["geometry"]
     sized = given & {"dataset.width", "dataset.downscale", "dataset.factor"}
-    timed = config["backbone"]["name"] == TIMED and not given & STEPS
+    timed = config["backbone"]["name"] == TIMED_BACKBONE and not given & LENGTH_KEYS
     step = None if has_gpu() and composites_there() else REFERENCE
     if timed and step is not None:
-        tried = {"trainer": "quick", "dataset.skip": max(len(rig.c2w) // FEW, 1)}
-        tried |= {} if sized else {"dataset.width": min(TRIED, rig.size[1])}
+        tried = {"trainer": "quick", "dataset.skip": max(len(rig.c2w) // TIMED_PHOTOGRAPHS, 1)}
+        tried |= {} if sized else {"dataset.width": min(TIMED_COLUMNS, rig.size[1])}
         step = timed_steps(assemble(compose(*_overrides(chosen | tried, given), *others)))
-    found = plan(rig.size, minutes, step, torch.get_num_threads(), bool(sized))
-    chosen["trainer"] = found.budget
+    planned = plan(rig.size, minutes, step, torch.get_num_threads(), bool(sized))
+    chosen["trainer"] = planned.budget
     if timed:
         chosen["trainer.minutes"] = minutes
     if not sized:
-        chosen["dataset.width"] = found.width
-    budget = config["trainer"]["budget"] if "trainer" in given else f"{found.budget}, for minutes={minutes:g}"
-    say(f"{len(rig.c2w)} photographs, {found.width} pixels wide, budget {budget}")
-    if timed and found.told:
-        say(found.told)
+        chosen["dataset.width"] = planned.width
+    budget = config["trainer"]["budget"] if "trainer" in given else f"{planned.budget}, for minutes={minutes:g}"
+    say(f"{len(rig.c2w)} photographs, {planned.width} pixels wide, budget {budget}")
+    if timed and planned.told:
+        say(planned.told)
     return [*_overrides(chosen, given), *others]
 
 

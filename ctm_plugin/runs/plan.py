@@ -10,31 +10,31 @@ import torch
 from torch import nn
 
 from ctm_plugin.backbones.splat import Splat
-from ctm_plugin.callbacks.deadline import SHORTEST
+from ctm_plugin.callbacks.deadline import MIN_STRETCH
 from ctm_plugin.color.transform import fitted
 from ctm_plugin.draws import Draws
 from ctm_plugin.runs.assemble import Parts
 
-STEPS = {"standard": 2500, "quick": 1500}
-"""Of splats, by budget."""
-LEAST = {"standard": 300, "quick": 160}
-"""Columns of pictures from which on a budget pays."""
-WIDEST = 1600
-"""Columns: more show no more than a few minutes can learn."""
-TRIED = 300
-"""Columns of the pictures whose steps are timed."""
-FIRST, TIMED = 3, 8
-"""Steps that find their memory, and steps under the clock."""
-FIXED = 38_000
-"""Pixels that take as long as what a step does for any picture."""
-MIDDLE = 1.4
-"""What a step costs in the middle of a training, in units of :meth:`Splat.cost`."""
-GAUSSIANS, SIZE = 15_000, 0.009
-"""How many there are when steps are timed, and their standard deviation on the picture, in its widths."""
-ALONE = 0.5
-"""Share of a step that one thread has to do."""
-WIDER = 1.6
-"""Factor on the width, for which the time is said too."""
+BUDGET_STEPS = {"standard": 2500, "quick": 1500}
+"""Steps of splats by budget."""
+COLUMNS = {"standard": 300, "quick": 160}
+"""Least width of pictures in pixels that a budget is worth by budget."""
+MAX_COLUMNS = 1600
+"""Largest width in pixels: more show no more than a few minutes can learn."""
+TIMED_COLUMNS = 300
+"""Width in pixels of the pictures whose steps are timed."""
+WARMUP_STEPS, TIMED_STEPS = 3, 8
+"""Steps that allocate memory, and steps under the clock."""
+FIXED_PIXELS = 38_000
+"""Cost of a step on an empty picture, in pixels."""
+MIDDLE_COST = 1.4
+"""Cost of a step in the middle of a training, in units of :meth:`Splat.cost`."""
+TIMED_GAUSSIANS, TIMED_SIGMA = 15_000, 0.009
+"""Number of Gaussians when steps are timed, and their standard deviation on the picture, in its widths."""
+SERIAL_SHARE = 0.5
+"""Share of a step that does not run in parallel."""
+WIDER_FACTOR = 1.6
+"""Factor on the width whose time is printed as an alternative."""
 
 
 class Timed(NamedTuple):
@@ -45,7 +45,7 @@ class Timed(NamedTuple):
 
 
 REFERENCE = Timed(0.04, 300 * 225)
-"""Of a machine that was not asked."""
+"""Timing of a machine that was measured once, for machines that are not timed."""
 
 
 class Plan(NamedTuple):
@@ -62,20 +62,19 @@ def timed_steps(parts: Parts) -> Timed:
     Gaussians are as many, and as large on the picture, as they are in the middle of a training.
     """
     module, threads = parts.backbone, torch.get_num_threads()
-    parts.attach.attach(module)
     fitted(module.transform, module.some_colors())
     module.on_train_start()
     _grow(module)
     optimizers = module.configure_optimizers()
     torch.set_num_threads(1)
     try:
-        for step in range(FIRST + TIMED):
-            if step == FIRST:
+        for step in range(WARMUP_STEPS + TIMED_STEPS):
+            if step == WARMUP_STEPS:
                 start = time.thread_time()
             optimizers.zero_grad()
             module.training_step(None, 0)["loss"].backward()
             optimizers.step()
-        seconds = (time.thread_time() - start) / TIMED * module.cost(0, module.schedule_steps) / MIDDLE
+        seconds = (time.thread_time() - start) / TIMED_STEPS * module.cost(0, module.schedule_steps) / MIDDLE_COST
     finally:
         torch.set_num_threads(threads)
     return Timed(seconds, parts.scene.train.height * parts.scene.train.width)
@@ -85,20 +84,20 @@ def timed_steps(parts: Parts) -> Timed:
 def _grow(module: Splat) -> None:
     """Take Gaussians at random places between those that a module begins with, of sizes found in trained ones."""
     draws, views, tables = Draws(module.seed, 0, stream="plan"), module.scene.train, module.gaussians
-    one, other = (draws.integers(len(tables.means), GAUSSIANS) for _ in range(2))
+    one, other = (draws.integers(len(tables.means), TIMED_GAUSSIANS) for _ in range(2))
     means = tables.means[one].lerp(tables.means[other], 0.01)
     distances = (means - views.c2w[0, :, 3]).norm(dim=1, keepdim=True)
-    sizes = SIZE * views.width * distances / views.intrinsics[0, 0]
+    sizes = TIMED_SIGMA * views.width * distances / views.intrinsics[0, 0]
     grown = tables._replace(
         means=means,
-        scales=sizes.log() + 0.6 * draws.normal(GAUSSIANS, 3),
-        turns=draws.normal(GAUSSIANS, 4),
-        opacities=1.5 * draws.normal(GAUSSIANS, 1),
-        base=tables.base[one],
-        rest=tables.rest[one],
+        scales=sizes.log() + 0.6 * draws.normal(TIMED_GAUSSIANS, 3),
+        quats=draws.normal(TIMED_GAUSSIANS, 4),
+        opacities=1.5 * draws.normal(TIMED_GAUSSIANS, 1),
+        sh0=tables.sh0[one],
+        shN=tables.shN[one],
     )
     module.tables.update({name: nn.Parameter(table) for name, table in grown._asdict().items()})
-    module.push, module.seen = torch.zeros(GAUSSIANS), torch.zeros(GAUSSIANS)
+    module.grad2d, module.grad2d_count = torch.zeros(TIMED_GAUSSIANS), torch.zeros(TIMED_GAUSSIANS)
 
 
 def plan(
@@ -114,37 +113,37 @@ def plan(
         given: whether the size is not to be chosen.
     """
     width = size[1]
-    most = width if given else min(width, WIDEST)
+    limit = width if given else min(width, MAX_COLUMNS)
     if timed is None:
-        return Plan(most, "standard")
-    for budget in STEPS:
-        columns = width if given else min(most, max(_columns(size, minutes, budget, timed, threads), LEAST["quick"]))
-        found = _minutes(size, columns, budget, timed, threads)
-        if columns >= LEAST[budget] and (found < 2 * minutes or budget == "quick"):
+        return Plan(limit, "standard")
+    for budget in BUDGET_STEPS:
+        columns = width if given else min(limit, max(_columns(size, minutes, budget, timed, threads), COLUMNS["quick"]))
+        predicted = _minutes(size, columns, budget, timed, threads)
+        if columns >= COLUMNS[budget] and (predicted < 2 * minutes or budget == "quick"):
             break
-    if found * SHORTEST > minutes:
-        told = f"minutes={minutes:g} is too short here: it takes about {found * SHORTEST:.2g} minutes"
+    if predicted * MIN_STRETCH > minutes:
+        advice = f"minutes={minutes:g} is too short here: it takes about {predicted * MIN_STRETCH:.2g} minutes"
     elif columns < width:
-        wider = min(width, math.ceil(WIDER * columns / 100) * 100)
-        more = math.ceil(_minutes(size, wider, "standard" if wider >= LEAST["standard"] else "quick", timed, threads))
-        told = f"{wider} pixels wide would take about {more} minutes: dataset.width={wider} minutes={more}"
+        wider = min(width, math.ceil(WIDER_FACTOR * columns / 100) * 100)
+        more = math.ceil(_minutes(size, wider, "standard" if wider >= COLUMNS["standard"] else "quick", timed, threads))
+        advice = f"{wider} pixels wide would take about {more} minutes: dataset.width={wider} minutes={more}"
     else:
-        told = ""
-    return Plan(columns, budget, told)
+        advice = ""
+    return Plan(columns, budget, advice)
 
 
 def _seconds(pixels: int | float, timed: Timed, threads: int) -> float:
     """Guess what a step takes, on average of a training."""
-    shared = ALONE + (1 - ALONE) / threads
-    return shared * timed.seconds * (pixels + FIXED) / (timed.pixels + FIXED)
+    shared = SERIAL_SHARE + (1 - SERIAL_SHARE) / threads
+    return shared * timed.seconds * (pixels + FIXED_PIXELS) / (timed.pixels + FIXED_PIXELS)
 
 
 def _minutes(size: tuple[int, int], columns: int, budget: str, timed: Timed, threads: int) -> float:
     height, width = size
-    return STEPS[budget] * _seconds(columns**2 * height / width, timed, threads) / 60
+    return BUDGET_STEPS[budget] * _seconds(columns**2 * height / width, timed, threads) / 60
 
 
 def _columns(size: tuple[int, int], minutes: int | float, budget: str, timed: Timed, threads: int) -> int:
     height, width = size
-    pixels = 60 * minutes / STEPS[budget] / _seconds(1 - FIXED, timed, threads) - FIXED
+    pixels = 60 * minutes / BUDGET_STEPS[budget] / _seconds(1 - FIXED_PIXELS, timed, threads) - FIXED_PIXELS
     return round(math.sqrt(max(pixels, 0) * width / height))

@@ -14,7 +14,7 @@ from pathlib import Path
 from ctm_plugin.errors import CTMError
 
 GRACE_S = 10.0
-"""How long the others may take to end after one has failed."""
+"""Seconds that other processes may take to end after one has failed."""
 
 
 def is_main_process() -> bool:

@@ -19,6 +19,7 @@ from torch import Tensor
 from ctm_plugin import __version__
 
 PACKAGES = ("torch", "lightning", "numpy", "hydra-core", "omegaconf", "torchmetrics", "scikit-image", "imageio")
+"""Packages whose versions a run notes."""
 
 
 def fingerprint(data: Any) -> str:

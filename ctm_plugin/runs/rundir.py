@@ -5,7 +5,6 @@ from __future__ import annotations
 import fcntl
 import itertools
 import json
-import os
 import reprlib
 import shlex
 from collections.abc import Iterator
@@ -22,12 +21,13 @@ from ctm_plugin.files import create
 from ctm_plugin.settings.build import SECTIONS, Config
 
 CONFIG, METRICS, ERROR, PAGE = "config.yaml", "metrics.json", "error.txt", "index.html"
+ALL = "all"
+"""Folder of all views, lit."""
 LAST, PREVIOUS, DAMAGED = (f"checkpoints/{name}.ckpt" for name in ("last", "previous", "damaged"))
-NEWEST = Path("last")
-HOMES = (Path("runs"), Path("multirun"))
-"""Where runs are, unless their command lines said otherwise."""
-DEEPEST = 50
-"""Lists and mappings inside one another, at most."""
+NEWEST_LINK = Path("last")
+"""Link to the newest run."""
+RUN_FOLDERS = (Path("runs"), Path("multirun"))
+"""Folders that hold runs, by default."""
 Loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # ten times as fast, where libyaml is
 
 
@@ -43,9 +43,9 @@ def runs_of(path: Path) -> list[Path]:
     Raises:
         CheckpointError: ``last`` is given, and there are no runs.
     """
-    if path == NEWEST and not path.exists():
-        if not (runs := _below(*HOMES)):
-            raise CheckpointError(path, f"no run in {' or '.join(map(str, HOMES))}", "one")
+    if path == NEWEST_LINK and not path.exists():
+        if not (runs := _below(*RUN_FOLDERS)):
+            raise CheckpointError(path, f"no run in {' or '.join(map(str, RUN_FOLDERS))}", "one")
         return runs[-1:]
     if path.is_file() and path.match(LAST):
         return [path.parents[1]]
@@ -105,12 +105,12 @@ def there_already(run: Path) -> CheckpointError:
     return CheckpointError(run, "a run that is there already", f"a new directory, or resume={shlex.quote(str(run))}")
 
 
-def note_colors(run: Path, found: str | None) -> None:
+def note_colors(run: Path, description: str | None) -> None:
     """Let ``config.yaml`` say, in a comment, what was fitted to the scene's colours; ``None``: nothing was."""
-    note = f"# fitted to the scene's colours: {found}\n"
+    note = f"# fitted to the scene's colours: {description}\n"
     # Added to, not replaced: the lock is the file's.
     with (run / CONFIG).open("r+", encoding="utf-8") as file:
-        if found and note not in file.readlines():
+        if description and note not in file.readlines():
             file.write(note)
 
 
@@ -144,12 +144,11 @@ def load_config(run: Path) -> dict[str, Any]:
         raise CheckpointError(run, "a file" if run.exists() else "no such directory", "a run directory")
     if not path.is_file():
         raise CheckpointError(run, f"no {CONFIG}", "a run directory")
-    check_folder(run)
     config = read_yaml(path)
     version = config.pop("version", None)
     if not isinstance(version, str) or version.split(".")[:2] != __version__.split(".")[:2]:
-        found = "0.5 or older" if version is None else reprlib.repr(version)
-        raise CheckpointError(run, f"a run of version {found}", f"one of this version, {__version__}")
+        wrote = "0.5 or older" if version is None else reprlib.repr(version)
+        raise CheckpointError(run, f"a run of version {wrote}", f"one of this version, {__version__}")
     missing = [name for name in SECTIONS if not isinstance(config.get(name), dict)]
     if missing or "seed" not in config:
         raise CheckpointError(path, f"nothing for {', '.join(missing) or 'seed'}", "a run's configuration")
@@ -163,44 +162,25 @@ def differences(a: Any, b: Any, key: str = "") -> list[str]:
     """Find the keys at which two configurations differ."""
     if isinstance(a, dict) and isinstance(b, dict):
         prefix = f"{key}." if key else ""
-        return [found for k in sorted({*a, *b}) for found in differences(a.get(k), b.get(k), f"{prefix}{k}")]
+        return [line for k in sorted({*a, *b}) for line in differences(a.get(k), b.get(k), f"{prefix}{k}")]
     return [] if a == b else [key]
 
 
-# Reading what strangers may have made: plain values, inside the folder, no larger than the files.
-
-
-def check_folder(run: Path) -> None:
-    """Refuse a folder in which something leads out of it, or would block or never end when it is read.
-
-    Raises:
-        CheckpointError: it holds a link that leads outside, a pipe or a device.
-    """
-    root = os.path.realpath(run)
-    for path in run.rglob("*"):
-        if path.is_symlink() and not Path(os.path.realpath(path)).is_relative_to(root):
-            raise CheckpointError(path, f"a link to {os.readlink(path)}", "nothing that leads out of the run")
-        if path.exists() and not (path.is_file() or path.is_dir()):
-            raise CheckpointError(path, "something that is not a file", "only files and folders")
+# Reading what strangers may have made: plain values.
 
 
 def read_yaml(path: Path) -> dict[str, Any]:
-    """Read a mapping out of YAML that holds only plain values.
-
-    Tags make objects, a few lines with aliases make gigabytes, and what is nested deeply ends libyaml's process: runs
-    are saved with none of these.
+    """Read a mapping of plain values out of YAML: tags, which make objects, and aliases, which go round, are refused.
 
     Raises:
         CheckpointError: it cannot be read, or holds something else.
     """
     try:
-        text, depth = path.read_text(encoding="utf-8"), 0
-        for event in yaml.parse(text, Loader=Loader):
-            depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
-            if depth > DEEPEST or isinstance(event, yaml.AliasEvent) or getattr(event, "tag", None) is not None:
-                raise ValueError("a tag, an alias, or too deep")
+        text = path.read_text(encoding="utf-8")
+        if any(isinstance(event, yaml.AliasEvent) for event in yaml.parse(text, Loader=Loader)):
+            raise ValueError("an alias")
         value = yaml.load(text, Loader=Loader)
-    except (OSError, ValueError, yaml.YAMLError) as error:
+    except (OSError, LookupError, ValueError, yaml.YAMLError) as error:
         raise CheckpointError(path, f"no readable YAML ({type(error).__name__})", "plain values") from error
     return _mapping(value, path)
 

@@ -11,8 +11,10 @@ from ctm_plugin.color.settings import LightConfig
 from ctm_plugin.errors import ConfigError
 from ctm_plugin.settings.setting import REQUIRED, Settings, setting
 
-PATHS = ("capture", "orbit", "spiral", "test")
+CAMERA_PATHS = ("capture", "orbit", "spiral", "test")
+"""Names of camera paths."""
 EXPORTS = ("splats", "points", "mesh", "depth", "cameras", "pictures", "page")
+"""Names of what a run is exported as."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,15 +45,14 @@ class TrainerConfig(Settings, section="trainer"):
         "minutes that training takes: its schedule is stretched or cut to end then, of splats; null: all its steps",
         above=0,
     )
-    replay: bool = setting(False, "on a GPU replay steps as one CUDA graph; no card has tried that yet")
 
     @property
     def backend(self) -> str:
         """What trains, ``cuda`` or ``cpu``: Lightning would take Apple's GPUs as well, which have no float64."""
         import torch
 
-        found = self.accelerator == "auto" and torch.cuda.is_available()
-        return "cuda" if found or self.accelerator == "gpu" else "cpu"
+        available = self.accelerator == "auto" and torch.cuda.is_available()
+        return "cuda" if available or self.accelerator == "gpu" else "cpu"
 
     @property
     def numbers(self) -> str:
@@ -87,8 +88,8 @@ class TrainerConfig(Settings, section="trainer"):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Place(Settings, section="dataset"):
-    """Where a run's data are."""
+class DataFolder(Settings, section="dataset"):
+    """Folder of a run's data."""
 
     root: str | None = setting(None, "folder with the run's data, if they have been moved")
 
@@ -97,7 +98,7 @@ class Place(Settings, section="dataset"):
 class RunConfig(Settings):
     """What can be said of a run that is read again."""
 
-    dataset: Place = Place()
+    dataset: DataFolder = DataFolder()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -159,8 +160,8 @@ class VideoConfig(LitConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.path is not None and not self.path.endswith(".json") and self.path not in PATHS:
-            raise self.fault("path", f"one of {', '.join(PATHS)}, FILE.json")
+        if self.path is not None and not self.path.endswith(".json") and self.path not in CAMERA_PATHS:
+            raise self.fault("path", f"one of {', '.join(CAMERA_PATHS)}, FILE.json")
         if self.out is not None and (suffix := Path(self.out).suffix) not in (".gif", ".mp4", ".webp"):
             raise ConfigError("out", suffix, "one of .gif, .mp4, .webp")
         if self.out is not None and suffix == ".mp4" and not can_mp4():

@@ -16,14 +16,14 @@ from ctm_plugin.errors import CTMError
 from ctm_plugin.metrics.precision import full_float32
 from ctm_plugin.show.bars import tracked
 
-THICKNESS = 0.01
-"""Of the layer that stops the light of a mesh's surface, of the longest side of its box."""
-CHUNK = 1 << 15
-"""Points that are asked of a field in one go."""
-JUMP = 0.1
-"""Largest difference of neighbours' distances, of their own, on one surface: what lies between two is on neither."""
-APART = 1e-3
-"""Half the distance over which a cloud's normals are differences, of the distance to the camera."""
+LAYER_THICKNESS = 0.01
+"""Thickness of the layer that makes a mesh's surface opaque, as a share of the box's longest side."""
+POINTS = 1 << 15
+"""Points that a field is evaluated at in one go."""
+MAX_DEPTH_STEP = 0.1
+"""Largest relative difference of neighbouring pixels' depths on one surface."""
+NORMAL_OFFSET = 1e-3
+"""Half the distance of the differences that a cloud's normals are made of, as a share of the distance to the camera."""
 
 
 class Surface(NamedTuple):
@@ -43,8 +43,8 @@ class Surface(NamedTuple):
 
 def stopped(module: PosedBackbone, points: Float[Tensor, "m 3"], length: Tensor | float) -> Float[Tensor, " m"]:
     """How much light a length of what lies at points ``[M, 3]`` stops, ``[M]``: ``1 - exp(-density length)``."""
-    looked = torch.tensor([0.0, 0.0, -1.0], device=points.device).expand_as(points)
-    density = torch.cat([module.query(*part)[0] for part in zip(points.split(CHUNK), looked.split(CHUNK), strict=True)])
+    axis = torch.tensor([0.0, 0.0, -1.0], device=points.device).expand_as(points)
+    density = torch.cat([module.query(*part)[0] for part in zip(points.split(POINTS), axis.split(POINTS), strict=True)])
     return -torch.expm1(-density * length)
 
 
@@ -71,7 +71,7 @@ def spanned(points: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:
 
 
 @torch.no_grad()
-def cloud(module: PosedBackbone, most: int, opaque: float) -> Surface:
+def cloud(module: PosedBackbone, max_points: int, opaque: float) -> Surface:
     """What the training views see: where their rays end, in the colours that they have there.
 
     Normals are the density's, or of a backbone that does not tell it what neighbouring rays' ends say.
@@ -85,8 +85,8 @@ def cloud(module: PosedBackbone, most: int, opaque: float) -> Surface:
         CTMError: nothing does.
     """
     scene, views, tells = module.scene, module.scene.train, type(module).query is not PosedBackbone.query
-    every = max(1, math.ceil(math.sqrt(len(views) * views.height * views.width / most)))
-    found = []
+    every = max(1, math.ceil(math.sqrt(len(views) * views.height * views.width / max_points)))
+    parts = []
     with full_float32(module.device):
         for index in tracked(range(len(views)), "views"):
             view = module.render_view(views, index, every, rays=1)
@@ -98,19 +98,19 @@ def cloud(module: PosedBackbone, most: int, opaque: float) -> Surface:
             there = view["opacity"] >= opaque
             seen = torch.where(there, along, scene.far)[None]
             jump = (F.max_pool2d(seen, 3, 1, 1) + F.max_pool2d(-seen, 3, 1, 1))[0]
-            keep = (there & (jump <= JUMP * along)).flatten()
+            keep = (there & (jump <= MAX_DEPTH_STEP * along)).flatten()
             if views.mask is not None:
                 keep &= views.mask[index].to(module.device).flatten()[own - index * views.height * views.width]
             points = rays.origins + along.flatten()[:, None] * rays.directions
             normal = spanned(points.unflatten(0, along.shape)).flatten(0, 1)[keep]
             points, directions = points[keep], rays.directions[keep]
             if tells:
-                normal = normals(module, points, APART * along.flatten()[keep])
+                normal = normals(module, points, NORMAL_OFFSET * along.flatten()[keep])
             facing = (normal * directions).sum(1, keepdim=True)
             # What is seen faces the camera; where there is no gradient, straight.
             normal = torch.where(facing == 0, -directions, -normal * facing.sign())
-            found.append((points, normal, view["rgb"].flatten(0, 1)[keep]))
-    points, normal, colors = (torch.cat(part).float().cpu() for part in zip(*found, strict=True))
+            parts.append((points, normal, view["rgb"].flatten(0, 1)[keep]))
+    points, normal, colors = (torch.cat(part).float().cpu() for part in zip(*parts, strict=True))
     if not len(points):
         raise CTMError(f"no ray of the training views stops {opaque:g} of its light; a lower opaque finds more")
     return Surface(points, normal, colors.clamp(0, 1))
@@ -123,14 +123,14 @@ def mesh(module: PosedBackbone, cells: int, opaque: float) -> Surface:
     Args:
         module: with its weights.
         cells: along the longest side of the box.
-        opaque: share of the light that what lies on the surface would stop if it were ``THICKNESS`` thick.
+        opaque: share of the light that what lies on the surface would stop if it were ``LAYER_THICKNESS`` thick.
 
     Raises:
         CTMError: there is no such surface, or the backbone does not tell densities.
     """
     low, high = module.world_box().to(module.device)
     longest = float((high - low).max())
-    side, layer = longest / cells, THICKNESS * longest
+    side, layer = longest / cells, LAYER_THICKNESS * longest
     counts = [max(2, math.ceil(length / side - 1e-6) + 1) for length in (high - low).tolist()]
     x, y, z = (start + side * torch.arange(n, device=module.device) for start, n in zip(low, counts, strict=True))
     with full_float32(module.device):
@@ -147,7 +147,7 @@ def mesh(module: PosedBackbone, cells: int, opaque: float) -> Surface:
         )
         points = torch.from_numpy(vertices.copy()).float().to(module.device) + low - side
         normal = normals(module, points, side / 2)
-        parts = zip(points.split(CHUNK), normal.split(CHUNK), strict=True)
+        parts = zip(points.split(POINTS), normal.split(POINTS), strict=True)
         colors = torch.cat([module.decode(module.query(at, -out)[1].float()) for at, out in parts])
     return Surface(
         points.cpu(), normal.cpu(), colors.float().cpu().clamp(0, 1), torch.from_numpy(faces.astype("int32"))

@@ -7,6 +7,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+from ctm_plugin.data.capture import Capture
 from ctm_plugin.errors import CheckpointError
 from ctm_plugin.runs.rundir import CONFIG, ERROR, METRICS, load_config, read_json
 from ctm_plugin.runs.train import resume, train
@@ -14,7 +15,7 @@ from ctm_plugin.settings.build import Config
 from ctm_plugin.show.console import print_line
 
 
-def go_on(config: Config, sweep: Path, folder: Path) -> dict[str, Any]:
+def go_on(config: Config, sweep: Path, folder: Path, capture: Capture | None = None) -> dict[str, Any]:
     """Do a sweep's run that may have been begun before: finished, it stays as it is; interrupted, it goes on.
 
     Runs are known by their configuration, so that their numbers may differ from the unfinished sweep's.
@@ -22,6 +23,7 @@ def go_on(config: Config, sweep: Path, folder: Path) -> dict[str, Any]:
     Args:
         config, sweep: the resolved configuration, and the sweep's folder.
         folder: where the run goes if it is new; a folder next to it where that is taken.
+        capture: of its data, where they have been read.
 
     Returns:
         What ``metrics.json`` holds.
@@ -39,16 +41,16 @@ def go_on(config: Config, sweep: Path, folder: Path) -> dict[str, Any]:
         (run / ERROR).unlink(missing_ok=True)
         return resume(run, print_line)
     names = itertools.chain([folder], (folder.with_name(f"{folder.name}_{n}") for n in itertools.count(2)))
-    return train(config, next(each for each in names if not (each / CONFIG).exists()), print_line)
+    return train(config, next(each for each in names if not (each / CONFIG).exists()), print_line, capture)
 
 
 def finished(sweep: Path) -> list[tuple[Config, dict[str, Any]]]:
     """Read configurations and scores of a sweep's finished runs; what cannot be read is left out."""
-    found = []
+    results = []
     for path in sorted(sweep.glob(f"*/{METRICS}")):
         with suppress(CheckpointError):
-            found.append((load_config(path.parent), read_json(path)))
-    return found
+            results.append((load_config(path.parent), read_json(path)))
+    return results
 
 
 def same_run(saved: Config, config: Config) -> bool:

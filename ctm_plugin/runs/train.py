@@ -24,11 +24,12 @@ from ctm_plugin.color.settings import LossWeights
 from ctm_plugin.cpu.allocator import keep_memory
 from ctm_plugin.cpu.products import fast_products
 from ctm_plugin.cpu.threads import operators_on_one_thread, warn_of_neighbours
+from ctm_plugin.data.capture import Capture
 from ctm_plugin.errors import CheckpointError, CTMError, Interrupted
 from ctm_plugin.files import naming
 from ctm_plugin.runs.assemble import Parts, assemble
 from ctm_plugin.runs.cameras import note_cameras
-from ctm_plugin.runs.data import DATA, check_data, located, note_data
+from ctm_plugin.runs.data import DATA_FILE, check_data, located, note_data
 from ctm_plugin.runs.evaluate import lpips_for, score
 from ctm_plugin.runs.load import go_back, load_checkpoint, restore
 from ctm_plugin.runs.processes import is_main_process, processes
@@ -51,24 +52,27 @@ from ctm_plugin.show.console import print_summary, quieten
 
 Tell = Callable[[dict[str, Any], Path], None]
 """Prints what ``metrics.json`` holds of the run in a directory."""
-UNLIKE = 1.2
-"""Times the light of another picture above which two were not exposed alike: a quarter of a stop."""
-SHORT = 20_000 * 5e-4
-"""Steps times learning rate below which a transform that is not pre-trained is no near-identity in time (paper: 50)."""
-PARTS = ("dataset", "backbone", "ctm", "color_space", "appearance", "loss")
-"""What scores depend on."""
-SAID = {f"{group}{key}" for group in PARTS for key in ("", ".name", ".preset")}
-SAID |= {"dataset.exposure", "dataset.root", "dataset.image", "loss.kind"}
+MAX_EXPOSURE_RATIO = 1.2
+"""Largest ratio of two pictures' light that counts as one exposure: a quarter of a stop."""
+MIN_TRAINING = 20_000 * 5e-4
+"""Steps times learning rate below which a transform without pre-training is not near the identity in time (paper:
+50)."""
+SCORED_SECTIONS = ("dataset", "backbone", "ctm", "color_space", "appearance", "loss")
+"""Sections of the configuration that scores depend on."""
+NOTED_KEYS = {f"{group}{key}" for group in SCORED_SECTIONS for key in ("", ".name", ".preset")}
+"""Keys of these that the line about a run names otherwise."""
+NOTED_KEYS |= {"dataset.exposure", "dataset.root", "dataset.image", "loss.kind"}
 """What has a shorter name, or follows from the data set's name."""
 
 
-def train(config: Config, run: Path, tell: Tell = print_summary) -> dict[str, Any]:
+def train(config: Config, run: Path, tell: Tell = print_summary, capture: Capture | None = None) -> dict[str, Any]:
     """Train, render and score a new run in the directory ``run``.
 
     Args:
         config: the resolved configuration, plain containers.
         run: a new directory, or one that holds no run.
         tell: prints what was found.
+        capture: of its data, where they have been read.
 
     Returns:
         What ``metrics.json`` holds.
@@ -78,7 +82,7 @@ def train(config: Config, run: Path, tell: Tell = print_summary) -> dict[str, An
     """
     if is_main_process() and any((run / name).exists() for name in (CONFIG, LAST, METRICS)):
         raise there_already(run)
-    parts = assemble(config, run)
+    parts = assemble(config, run, capture=capture)
     warn_of_short_run(config, parts)
     warn_of_exposures(config, parts)
     # What ``auto`` means here stays with the run, whatever machine goes on with it.
@@ -110,7 +114,7 @@ def resume(run: Path, tell: Tell = print_summary, root: str | None = None) -> di
         restore(parts, checkpoint, run / name)
         if is_main_process() and checkpoint["global_step"] >= (steps := parts.backbone.total_steps):
             print(f"{run}: finished, all {steps} steps are done; it is scored again", file=sys.stderr)
-    if is_main_process() and (root is not None or not (run / DATA).exists()):
+    if is_main_process() and (root is not None or not (run / DATA_FILE).exists()):
         note_data(run, there, parts.scene)
     del checkpoint  # Lightning reads its own; a large grid's would be held all through the training
     return _fit_and_score(config, run, parts, None if name is None else run / name, tell, new=False)
@@ -126,9 +130,9 @@ def command(run: Path, settings: RunConfig) -> None:
 
 def warn_of_short_run(config: Config, parts: Parts) -> None:
     """Warn where a learned transform will not be ready in time."""
-    steps, training = parts.backbone.total_steps, parts.attach.training
+    steps, training = parts.backbone.total_steps, parts.backbone.transform.learning
     unready = config["ctm"].get("init") == "random" and not training.pretrain_steps
-    if unready and steps * training.lr < SHORT:
+    if unready and steps * training.lr < MIN_TRAINING:
         warnings.warn(
             f"a transform without pre-training will hold back a run of {steps} steps (the paper's have 20,000 to "
             "100,000): ctm=quick is made for short ones",
@@ -141,8 +145,8 @@ def warn_of_exposures(config: Config, parts: Parts) -> None:
     exposures = parts.scene.train.exposures if parts.backbone.posed else None
     if exposures is None or config["appearance"]["name"] != "none":
         return
-    told = exposures[~exposures.isnan()]
-    if (ratio := float(told.max() / told.min())) > UNLIKE:
+    known = exposures[~exposures.isnan()]
+    if (ratio := float(known.max() / known.min())) > MAX_EXPOSURE_RATIO:
         warnings.warn(
             f"by their EXIF some pictures took {ratio:.3g} times the light of others: appearance=exposure "
             "appearance.start=exif holds that apart from the scene",
@@ -156,16 +160,16 @@ def hyperparameters(config: Config, module: Backbone, result: Mapping[str, Any])
     Without CTM its weights and frequencies are 0, so that runs without it have a place on every axis.
     """
     exposure = getattr(getattr(module, "scene", None), "exposure", None)
-    found = {name: result[name] for name in ("dataset", "backbone", "ctm", "color_space", "appearance", "steps")}
-    found |= {"seed": config["seed"], "loss": module.photometric.kind, "ctm.k": module.channels}
-    found["exposure"] = config["dataset"].get("exposure", 1.0) if exposure is None else exposure
-    found |= {"ctm.P": 0, "ctm.lr": 0.0, **{f"ctm.weights.{term}": 0.0 for term in vars(LossWeights())}}
-    for value, key in (node for group in PARTS for node in nodes(config[group], group)):
-        if key not in SAID and not key.rpartition(".")[2].isdigit():  # no part of a list
-            found[key] = value
+    values = {name: result[name] for name in ("dataset", "backbone", "ctm", "color_space", "appearance", "steps")}
+    values |= {"seed": config["seed"], "loss": module.photometric.kind, "ctm.k": module.channels}
+    values["exposure"] = config["dataset"].get("exposure", 1.0) if exposure is None else exposure
+    values |= {"ctm.P": 0, "ctm.lr": 0.0, **{f"ctm.weights.{term}": 0.0 for term in vars(LossWeights())}}
+    for value, key in (node for group in SCORED_SECTIONS for node in nodes(config[group], group)):
+        if key not in NOTED_KEYS and not key.rpartition(".")[2].isdigit():  # no part of a list
+            values[key] = value
     return {
         key: str(value).lower() if isinstance(value, bool) else value
-        for key, value in found.items()
+        for key, value in values.items()
         if isinstance(value, bool | int | float | str)
     }
 
@@ -195,8 +199,8 @@ def _fit_and_score(
                 try:
                     logger.open()
                 except Exception as error:  # of services, anything
-                    told = f"logger={config['logger']['name']}: {error}"
-                    raise error if isinstance(error, CTMError) else CTMError(told) from error
+                    text = f"logger={config['logger']['name']}: {error}"
+                    raise error if isinstance(error, CTMError) else CTMError(text) from error
                 stack.callback(logger.close)
         try:
             products, threads = fast_products(trainer.strategy.root_device), operators_on_one_thread(module.loops_only)
@@ -227,6 +231,7 @@ def _fit_and_score(
 def _trainer(config: Config, run: Path, parts: Parts, callbacks: list[L.Callback]) -> L.Trainer:
     quieten()
     settings, (stopwatch, last) = parts.trainer, callbacks
+    watched = bool(parts.loggers) or any(hasattr(each, "monitor") for each in parts.callbacks)
 
     def note(trainer: L.Trainer, module: L.LightningModule) -> None:
         if trainer.is_global_zero:
@@ -244,11 +249,14 @@ def _trainer(config: Config, run: Path, parts: Parts, callbacks: list[L.Callback
             max_steps=parts.backbone.total_steps,
             logger=parts.loggers,
             log_every_n_steps=settings.log_every,
+            val_check_interval=(settings.image_every or 1) * settings.accumulate_grad_batches,
+            check_val_every_n_epoch=None,
+            limit_val_batches=int(settings.image_every is not None and watched),  # one test view
+            num_sanity_val_steps=0,
             callbacks=[
                 stopwatch,
                 *([] if settings.minutes is None else [Deadline(60 * settings.minutes, stopwatch), Preview()]),
                 RunInfo(config),
-                parts.attach,
                 LambdaCallback(on_train_start=note),
                 FiniteLoss(run / LAST),
                 *parts.callbacks,

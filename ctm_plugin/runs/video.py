@@ -16,7 +16,7 @@ from ctm_plugin.backbones.posed import PosedBackbone
 from ctm_plugin.color.light import AS_IS, Light, chosen_light
 from ctm_plugin.cpu.products import fast_products
 from ctm_plugin.data.readers.key_frames import read_key_frames
-from ctm_plugin.data.rig import ROUND, turn
+from ctm_plugin.data.rig import SURROUND_DEGREES, turn
 from ctm_plugin.errors import ConfigError
 from ctm_plugin.files import replacing
 from ctm_plugin.runs.load import load_posed
@@ -28,12 +28,12 @@ from ctm_plugin.show.bars import tracked
 from ctm_plugin.show.console import print_next
 from ctm_plugin.show.pictures import beside
 
-TAGS = ":".join(f"{key}=bt709" for key in ("colorspace", "color_primaries", "color_trc"))
-BT709_AT_ONCE = ["-vf", f"scale=out_color_matrix=bt709:out_range=tv,setparams={TAGS}", "-movflags", "+faststart"]
-"""For ffmpeg: colours as players take films of this size to have them, said in the file, whose index comes first."""
+BT709_TAGS = ":".join(f"{key}=bt709" for key in ("colorspace", "color_primaries", "color_trc"))
+FFMPEG_BT709 = ["-vf", f"scale=out_color_matrix=bt709:out_range=tv,setparams={BT709_TAGS}", "-movflags", "+faststart"]
+"""ffmpeg's arguments: BT.709's colours, tagged as such, and the index at the file's beginning."""
 
-OFF = 0.9
-"""Of the middle's: a principal point that is nearer to the corner is that of a smaller picture on a larger canvas."""
+MIN_PRINCIPAL = 0.9
+"""Share of the middle's coordinate below which a principal point is that of a smaller picture on a larger canvas."""
 
 
 def render(run: Path, settings: VideoConfig) -> None:
@@ -60,7 +60,7 @@ def film(run: Path, settings: VideoConfig) -> Path:
     """
     posed = load_posed(run, settings.dataset.root, pictures=False)
     module, scene = posed.module, posed.module.scene
-    path = settings.path or ("orbit" if turn(scene.train.c2w.cpu().double().numpy()) >= ROUND else "capture")
+    path = settings.path or ("orbit" if turn(scene.train.c2w.cpu().double().numpy()) >= SURROUND_DEGREES else "capture")
     ending = ".mp4" if can_mp4() else ".gif"
     out = Path(settings.out) if settings.out else run / "video" / f"{Path(path).stem}{ending}"
     keys = read_key_frames(Path(path)) if path.endswith(".json") else None
@@ -111,7 +111,7 @@ def film_cameras(scene: Scene, path: str | KeyFrames, frames: int) -> list[Views
         paths = {"orbit": orbit, "capture": capture}
         c2w = paths[path](scene.train, frames) if path in paths else spiral(scene.train, scene.near, scene.far, frames)
     doubled = zip((test.width, test.height), (2 * lens[0, 2:]).tolist(), strict=True)
-    wide, high = (round(twice) if twice < OFF * side else side for side, twice in doubled)
+    wide, high = (round(twice) if twice < MIN_PRINCIPAL * side else side for side, twice in doubled)
     lenses = lens.expand(len(c2w), 4).split(1)
     return [
         Views(test.images[:1, :high, :wide], pose, lens, ("frame",), distortion=distortion)
@@ -140,7 +140,7 @@ def write_video(path: Path, frames: Sequence[np.ndarray], fps: Number) -> None:
 
 def encoded(frames: UInt8[np.ndarray, "f h w 3"], ending: str, fps: Number) -> bytes:
     """A film's frames as a file: GIF, WebP or H.264, as the ending says."""
-    mp4 = {"plugin": "FFMPEG", "fps": fps, "macro_block_size": 2, "output_params": BT709_AT_ONCE}
+    mp4 = {"plugin": "FFMPEG", "fps": fps, "macro_block_size": 2, "output_params": FFMPEG_BT709}
     return iio.imwrite(
         "<bytes>", frames, extension=ending, **(mp4 if ending == ".mp4" else {"duration": 1000 / fps, "loop": 0})
     )

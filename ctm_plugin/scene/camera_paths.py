@@ -17,18 +17,21 @@ from ctm_plugin.scene.poses import facing, looked_at, mean_pose
 from ctm_plugin.scene.views import Views
 from ctm_plugin.settings.setting import Number
 
-QUANTILE = 90
-"""Of the cameras' distances from the mean camera: how far out the spiral goes."""
-DEEPER, FARTHER = 0.75, 5.0
-"""The focus lies at this part of the way from the nearest to ``FARTHER`` times the farthest, in disparity."""
-DETOUR = 1.5
-"""Times as long may the way through cameras be in their own order as from one to the nearest left."""
-SMOOTH = 0.1
-"""Part of the way over which a path is the mean of the cameras."""
-DEPTH_TURNS = 0.5
-"""Times forth and back in a turn round."""
-LIT = ("light", "contrast", "saturation")
-"""Keys of the light that a path was seen in, as on the command line."""
+SPIRAL_PERCENTILE = 90
+"""Percentile of the cameras' distances from the mean camera: the spiral's radius."""
+FOCUS_SHARE, FOCUS_FAR = 0.75, 5.0
+"""The focus lies at this share of the way, in disparity, from the nearest depth to ``FOCUS_FAR`` times the farthest."""
+MAX_DETOUR = 1.5
+"""Cameras keep their order of capture if the path through them is at most this much longer than from each to the
+nearest left."""
+SMOOTHING = 0.1
+"""Share of the path over which it is averaged."""
+DEPTH_CYCLES = 0.5
+"""Oscillations along the axis in a turn round."""
+LIGHT_KEYS = ("light", "contrast", "saturation")
+"""Keys of the light in which a path was made, as on the command line."""
+EASE = 0.15
+"""Share of the time in which a path's speed rises from 0, and in which it falls to 0 again."""
 
 
 def focus(near: Number, far: Number) -> float:
@@ -37,7 +40,7 @@ def focus(near: Number, far: Number) -> float:
     Args:
         near, far: distances that hold what the views see, > 0.
     """
-    return 1.0 / ((1.0 - DEEPER) / near + DEEPER / (FARTHER * far))
+    return 1.0 / ((1.0 - FOCUS_SHARE) / near + FOCUS_SHARE / (FOCUS_FAR * far))
 
 
 def spiral(views: Views, near: Number, far: Number, frames: int = 120, turns: int = 2) -> Float32[Tensor, "f 3 4"]:
@@ -59,9 +62,9 @@ def spiral(views: Views, near: Number, far: Number, frames: int = 120, turns: in
     c2w = views.c2w.cpu().double().numpy()
     mean = mean_pose(c2w)
     axes, eye = mean[:, :3], mean[:, 3]
-    radii = np.percentile(np.abs((c2w[:, :, 3] - eye) @ axes), QUANTILE, axis=0)
+    radii = np.percentile(np.abs((c2w[:, :, 3] - eye) @ axes), SPIRAL_PERCENTILE, axis=0)
     angle = 2.0 * np.pi * turns * np.arange(frames) / frames
-    place = np.stack([np.cos(angle), -np.sin(angle), -np.sin(DEPTH_TURNS * angle)], axis=1) * radii
+    place = np.stack([np.cos(angle), -np.sin(angle), -np.sin(DEPTH_CYCLES * angle)], axis=1) * radii
     back = place - np.array([0.0, 0.0, -focus(near, far)])
     back /= np.linalg.norm(back, axis=1, keepdims=True)
     poses = axes @ facing(back, [0.0, 1.0, 0.0], place)
@@ -78,15 +81,15 @@ def walk(centres: Float64[np.ndarray, "n 3"]) -> Int64[np.ndarray, " n"]:
         left[order] = np.inf
         order.append(int(left.argmin()))
     steps = apart[np.arange(len(centres) - 1), np.arange(1, len(centres))].sum()
-    own = steps <= DETOUR * apart[order[:-1], order[1:]].sum()
+    own = steps <= MAX_DETOUR * apart[order[:-1], order[1:]].sum()
     return np.arange(len(centres)) if own else np.array(order)
 
 
 def capture(views: Views, frames: int = 120) -> Float32[Tensor, "f 3 4"]:
-    """Smoothly past where the photographs were taken, at an even pace.
+    """Smoothly past where the photographs were taken, slowly at both ends.
 
     At s of the way along the line through all cameras (:func:`walk`) stands the mean of them, each weighed by
-    ``exp(-(s - s_i)^2 / (2 0.1^2))``; so the path stays among the cameras. It is walked through at even steps.
+    ``exp(-(s - s_i)^2 / (2 0.1^2))``; so the path stays among the cameras. It is walked through as :func:`eased` says.
 
     Args:
         views: whose cameras stand near to their neighbours.
@@ -96,10 +99,21 @@ def capture(views: Views, frames: int = 120) -> Float32[Tensor, "f 3 4"]:
     c2w = c2w[walk(c2w[:, :, 3])]
     along = _lengths(c2w[:, :, 3])
     fine = np.linspace(0.0, 1.0, 8 * max(frames, 16))
-    even = np.interp(np.linspace(0.0, 1.0, frames), _lengths(_means(c2w, along, fine)[:, :, 3]), fine)
-    mean = _means(c2w, along, even)
+    places = np.interp(eased(np.linspace(0.0, 1.0, frames)), _lengths(_means(c2w, along, fine)[:, :, 3]), fine)
+    mean = _means(c2w, along, places)
     back = mean[:, :, 2] / np.linalg.norm(mean[:, :, 2], axis=1, keepdims=True)
     return torch.from_numpy(facing(back, mean[:, :, 1], mean[:, :, 3])).to(torch.float32)
+
+
+def eased(times: Float64[np.ndarray, " n"]) -> Float64[np.ndarray, " n"]:
+    """How much of the way lies behind at times in [0, 1]: the speed rises evenly over :data:`EASE`, stays, and falls.
+
+    With e = EASE, ``s(t) = t^2 / (2 e (1 - e))`` up to e, ``(t - e / 2) / (1 - e)`` in the middle, ``1 - s(1 - t)`` at
+    the end.
+    """
+    ends = np.minimum(times, 1.0 - times)
+    half = np.where(ends < EASE, ends**2 / (2.0 * EASE), ends - EASE / 2.0) / (1.0 - EASE)
+    return np.where(times < 0.5, half, 1.0 - half)
 
 
 def _lengths(centres: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, " n"]:
@@ -111,7 +125,7 @@ def _lengths(centres: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, " n"]:
 
 def _means(c2w: np.ndarray, along: np.ndarray, places: np.ndarray) -> np.ndarray:
     """Means of matrices, ``[P, 3, 4]``, weighed by how near to each of the places on the way they are."""
-    weights = np.exp(-0.5 * ((places[:, None] - along) / SMOOTH) ** 2)
+    weights = np.exp(-0.5 * ((places[:, None] - along) / SMOOTHING) ** 2)
     return np.einsum("pn,nij->pij", weights / weights.sum(1, keepdims=True), c2w)
 
 
@@ -184,8 +198,8 @@ class KeyFrames:
         if self.closed:
             slopes[0] = slopes[-1] = (eyes[1] - eyes[-2]) / 2
         at = np.linspace(0, keys[-1], frames, endpoint=not self.closed)
-        turns = RotationSpline(keys, Rotation.from_matrix(c2w[:, :, :3]))(at).as_matrix()
-        poses = np.concatenate([turns, CubicHermiteSpline(keys, eyes, slopes)(at)[:, :, None]], axis=2)
+        rotations = RotationSpline(keys, Rotation.from_matrix(c2w[:, :, :3]))(at).as_matrix()
+        poses = np.concatenate([rotations, CubicHermiteSpline(keys, eyes, slopes)(at)[:, :, None]], axis=2)
         return torch.from_numpy(poses).float(), torch.from_numpy(PchipInterpolator(keys, fov)(at)).float()
 
     def content(self) -> dict[str, Any]:
@@ -194,5 +208,5 @@ class KeyFrames:
             {"camera_to_world": pose.tolist(), "fov": math.degrees(fov)}
             for pose, fov in zip(self.c2w, self.fov, strict=True)
         ]
-        lit = {} if self.lit is None else dict(zip(LIT, self.lit, strict=True))
+        lit = {} if self.lit is None else dict(zip(LIGHT_KEYS, self.lit, strict=True))
         return {"closed": self.closed, **lit, "keys": keys}

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from ctm_plugin.errors import DataError
 from ctm_plugin.rays.cameras import Rays, camera_rays, distort, undistort
-from ctm_plugin.rays.ndc import NDC, STEEPEST
+from ctm_plugin.rays.ndc import MIN_FORWARD, NDC
 from ctm_plugin.scene.poses import meeting_point
 from ctm_plugin.scene.views import Scene, Views
 
@@ -124,7 +124,7 @@ def reach(square: Float[Tensor, " p"], depth: Float[Tensor, " p"], radius: float
     return torch.where(left > 0, wide * (1 + steep.square()) / left, math.inf)
 
 
-class Projected(NamedTuple):
+class ProjectedPoints(NamedTuple):
     """Points in a picture: ``[P]`` columns and rows in pixels, depths along its axis, and whether it sees them."""
 
     column: Tensor
@@ -133,7 +133,7 @@ class Projected(NamedTuple):
     seen: Tensor
 
 
-def projected(points: Float[Tensor, "p 3"], views: Views, view: int) -> Projected:
+def projected(points: Float[Tensor, "p 3"], views: Views, view: int) -> ProjectedPoints:
     """Project points into a view, through its lens."""
     fx, fy, cx, cy = views.intrinsics[view].tolist()
     c2w = views.c2w[view].to(points)
@@ -150,7 +150,7 @@ def projected(points: Float[Tensor, "p 3"], views: Views, view: int) -> Projecte
     column, row = cx + fx * u, cy + fy * v
     width, height = views.extents[view].tolist()
     inside = (column >= 0) & (column <= width) & (row >= 0) & (row <= height)
-    return Projected(column, row, depth, inside & seen)
+    return ProjectedPoints(column, row, depth, inside & seen)
 
 
 def camera_ball(views: Views, near: float) -> tuple[Float[Tensor, " 3"], float]:
@@ -173,7 +173,7 @@ def ndc_of(scene: Scene) -> NDC:
     """
     fx, fy, _, _ = scene.train.intrinsics.mean(0).tolist()
     for views in (scene.train, scene.test):
-        steep = (edge_rays(views).directions[:, 2] > -STEEPEST).reshape(len(views), -1).any(1)
+        steep = (edge_rays(views).directions[:, 2] > -MIN_FORWARD).reshape(len(views), -1).any(1)
         if steep.any():
             found = f"view {views.names[int(steep.nonzero()[0])]}, which looks sideways or back"
             raise DataError(scene.name, found, "cameras that all look one way (dataset.geometry=forward)")

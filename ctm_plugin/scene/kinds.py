@@ -7,4 +7,4 @@ Background = Literal["black", "white", "random_matched", "random"]
 GEOMETRIES: tuple[str, ...] = get_args(Geometry)
 BACKGROUNDS: tuple[str, ...] = get_args(Background)
 AUTO = "auto"
-"""The geometry that is found from the cameras."""
+"""Name of the choice that finds the geometry from the cameras."""

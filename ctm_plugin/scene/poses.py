@@ -14,13 +14,14 @@ from ctm_plugin.errors import DataError
 from ctm_plugin.settings.setting import Number
 
 ROTATION_TOLERANCE = 1e-3
+"""Largest entry of ``R R^T - I`` of a rotation."""
 MAX_COORDINATE = 1e6
 """Largest coordinate of a pose in scene units: float32 resolves no more than 0.06 out there."""
 MIN_ANGLE = 1e-4
-"""Smallest field of view in radians, and the least by which one falls short of pi: focal lengths stay finite."""
+"""Least field of view in radians, and least distance of one from pi: focal lengths stay finite."""
 
-PARALLEL = 1e-4
-"""Mean squared sine of the angle between axes, below which nobody can tell where they meet: half a degree."""
+MIN_SINE_SQUARED = 1e-4
+"""Mean squared sine of the angle between axes below which their meeting point is unknown: half a degree."""
 
 
 def check_rotation(rotation: Float64[np.ndarray, "3 3"], source: Path, where: str) -> None:
@@ -107,8 +108,8 @@ class Similarity(NamedTuple):
         return self._replace(scale=1 / self.scale, turn=self.turn.T, shift=shift)
 
 
-STILL = Similarity(1.0, np.eye(3), np.zeros(3), off=0.0, angle=0.0)
-"""Of a world that is the other one."""
+IDENTITY = Similarity(1.0, np.eye(3), np.zeros(3), off=0.0, angle=0.0)
+"""The similarity that changes nothing."""
 
 
 def similarity(source: Float64[np.ndarray, "n 3 4"], target: Float64[np.ndarray, "n 3 4"]) -> Similarity:
@@ -148,7 +149,7 @@ def meeting_point(c2w: Float64[np.ndarray, "n 3 4"]) -> Float64[np.ndarray, " 3"
         ``None`` where they do not meet in front of all cameras: they look past one another, outwards or in parallel.
     """
     forward = -c2w[:, :, 2]
-    if np.linalg.eigvalsh(np.eye(3) - forward.T @ forward / len(forward))[0] < PARALLEL:
+    if np.linalg.eigvalsh(np.eye(3) - forward.T @ forward / len(forward))[0] < MIN_SINE_SQUARED:
         return None
     point = looked_at(c2w)
     depths = ((point - c2w[:, :, 3]) * forward).sum(1)

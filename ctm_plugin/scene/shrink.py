@@ -9,8 +9,8 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float, Float32
 from torch import Tensor
 
-WHOLE = 1 - 1e-5
-"""Of a pixel's area, but for rounding."""
+FULL_COVERAGE = 1 - 1e-5
+"""Share of a pixel's area that counts as all, but for rounding."""
 
 
 def shrink(image: Float32[Tensor, "h w c"], height: int, width: int) -> Float32[Tensor, "h2 w2 c"]:
@@ -55,7 +55,7 @@ def area_of_rows(image: Float32[Tensor, "h w c"], height: int) -> Float32[Tensor
 
 def shrink_mask(mask: Bool[Tensor, "h w"], height: int, width: int) -> Bool[Tensor, "h2 w2"]:
     """Which larger pixels count: those that lie whole in what counts."""
-    return area(mask[..., None].float(), height, width)[..., 0] > WHOLE
+    return area(mask[..., None].float(), height, width)[..., 0] > FULL_COVERAGE
 
 
 def shrink_depth(depth: Float[Tensor, "h w"], height: int, width: int) -> Float[Tensor, "h2 w2"]:

@@ -13,12 +13,13 @@ from ctm_plugin.scene.kinds import Background, Geometry
 from ctm_plugin.scene.poses import Similarity
 
 DARK_LEVEL = 0.3
+"""Level of sRGB below which pictures count as dark."""
 DERIVED = {"derived": True}
-"""Fields that follow from others and the files: no part of the data's fingerprint."""
+"""Metadata of fields that follow from others and the files: no part of the data's fingerprint."""
 ADDED = {"added": True}
-"""Fields that older versions lack: where they are ``None``, the data's fingerprint is what it was then."""
+"""Metadata of fields that older versions lack: where they are ``None``, the data's fingerprint stays as it was."""
 Pixels = UInt8[Tensor, "*shape c"] | Float32[Tensor, "*shape c"]
-"""sRGB of C = 3 channels, or 4 with *straight* alpha: 8 bits, or float32 in [0, 1] of pictures that have more."""
+"""sRGB of 3 channels, or 4 with *straight* alpha: 8 bits, or float32 in [0, 1] where files have more."""
 
 
 @dataclass(frozen=True)

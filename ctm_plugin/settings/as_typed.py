@@ -15,12 +15,12 @@ from hydra.core.override_parser.types import ChoiceSweep, Quote, QuotedString
 from hydra.errors import HydraException
 
 from ctm_plugin.errors import CTMError
-from ctm_plugin.settings.registry import REGISTRIES, SETTINGS, load
+from ctm_plugin.settings.registry import PRESET_SETTINGS, REGISTRIES, load
 
-HYDRAS = ("hydra.run.dir", "hydra.sweep.dir", "hydra.sweep.subdir")
-"""Folders among Hydra's own keys, which it does not sweep."""
-LEFT = re.compile(r"null|(?P<quote>['\"]).*(?P=quote)|(choice|glob|shuffle|sort|tag|str)\(.*\)", re.DOTALL)
-"""Values that are Hydra's to read, unless a file has such a name."""
+HYDRA_FOLDERS = ("hydra.run.dir", "hydra.sweep.dir", "hydra.sweep.subdir")
+"""Keys of Hydra's own folders, which it does not sweep."""
+HYDRA_VALUES = re.compile(r"null|(?P<quote>['\"]).*(?P=quote)|(choice|glob|shuffle|sort|tag|str)\(.*\)", re.DOTALL)
+"""Pattern of values that Hydra reads itself, unless a file has such a name."""
 
 
 def is_sweep(arguments: Iterable[str]) -> bool:
@@ -37,19 +37,19 @@ def as_typed(argument: str, sweep: bool) -> str:
         >>> as_typed("dataset.root=cap (1)", sweep=False), as_typed("dataset.root=1e5,it's", sweep=True)
         ("dataset.root='cap (1)'", "dataset.root='1e5','it\\\\'s'")
     """
-    key, _, value = argument.partition("=")
+    key, given, value = argument.partition("=")
     name = key.lstrip("+")
-    is_path = True if name in HYDRAS else _texts(name.partition(".")[0]).get(name)
-    if is_path is None:
+    is_path = True if name in HYDRA_FOLDERS else _texts(name.partition(".")[0]).get(name)
+    if is_path is None or not given:
         return argument
     values = list(values_of(value))
     a_name = is_path and not (sweep or all(map(_is_there, values)))
-    return f"{key}={_quoted(value) if name in HYDRAS or a_name else ','.join(map(_quoted, values))}"
+    return f"{key}={_quoted(value) if name in HYDRA_FOLDERS or a_name else ','.join(map(_quoted, values))}"
 
 
 def values_of(text: str) -> Iterator[str]:
     """Split at commas, but for those in the names of what is there."""
-    if LEFT.fullmatch(text):
+    if HYDRA_VALUES.fullmatch(text):
         yield text
         return
     parts = text.split(",")
@@ -61,15 +61,15 @@ def values_of(text: str) -> Iterator[str]:
 
 def bare(text: str) -> list[str]:
     """What a value names, without the quotes of Hydra's grammar; several where it has a choice of them."""
-    if not LEFT.fullmatch(text) or _is_there(text):
+    if not HYDRA_VALUES.fullmatch(text) or _is_there(text):
         return [text]
-    found = OverridesParser.create().parse_override(f"key={text}").value()
-    named = [getattr(each, "text", each) for each in (found.list if isinstance(found, ChoiceSweep) else [found])]
+    value = OverridesParser.create().parse_override(f"key={text}").value()
+    named = [getattr(each, "text", each) for each in (value.list if isinstance(value, ChoiceSweep) else [value])]
     return named if all(isinstance(each, str) for each in named) else [text]
 
 
 def _quoted(text: str) -> str:
-    if LEFT.fullmatch(text) and not _is_there(text):
+    if HYDRA_VALUES.fullmatch(text) and not _is_there(text):
         return text
     with suppress(HydraException):
         if OverridesParser.create().parse_override(f"key={text}").value() == text:
@@ -83,12 +83,12 @@ def _is_there(text: str) -> bool:
 
 def _texts(section: str) -> dict[str, bool]:
     """The dotted keys of a section that hold text, under all choices that it has, and whether it may be a path."""
-    registry, found = REGISTRIES.get(section), {}
-    for name in registry.names() if registry else [section] * (section in SETTINGS):
+    registry, keys = REGISTRIES.get(section), {}
+    for name in registry.names() if registry else [section] * (section in PRESET_SETTINGS):
         with suppress(CTMError):  # raised when it is asked for
-            settings = registry.settings(name) if registry else load(SETTINGS[section])
+            settings = registry.settings(name) if registry else load(PRESET_SETTINGS[section])
             below = f"{section}.{name}." if section == "callbacks" else f"{section}."
             for key, hint in get_type_hints(settings).items():
                 kinds = {*(get_args(hint) or (hint,))} - {NoneType}
-                found |= {f"{below}{key}": Path in kinds} if kinds and kinds <= {str, Path} else {}
-    return found
+                keys |= {f"{below}{key}": Path in kinds} if kinds and kinds <= {str, Path} else {}
+    return keys

@@ -20,9 +20,9 @@ Config = Mapping[str, Any]
 SECTIONS = (
     "dataset", "backbone", "ctm", "color_space", "appearance", "loss", "trainer", "metrics", "logger", "callbacks",
 )  # fmt: skip
-"""Parts of a resolved configuration."""
-NO, YES = ("none", "off", "no", "null", "false", "0"), ("on", "yes", "true", "1")
-"""Words for a choice of nothing, and for the plain one."""
+"""Sections of a resolved configuration."""
+NO_WORDS, YES_WORDS = ("none", "off", "no", "null", "false", "0"), ("on", "yes", "true", "1")
+"""Words that choose nothing, and words that choose the plain one."""
 TYPES = {int: "an integer", float: "a number", bool: "true or false", str: "text", type(None): "null"}
 TYPES |= {tuple: "a list", list: "a list", dict: "a mapping"}
 T = TypeVar("T")
@@ -39,6 +39,11 @@ def _by_geometry(bounded: Any, other: Any, unbounded: Any = None, *, _parent_: N
     return unbounded if _parent_.geometry == "unbounded" and unbounded is not None else other
 
 
+def _by_budget(quick: Any, standard: Any, *, _root_: Node) -> Any:
+    """``${by_budget:A,B}``: B where the budget is standard, else A."""
+    return standard if OmegaConf.select(_root_, "trainer.budget") == "standard" else quick
+
+
 def _scene(*, _root_: Node) -> str:
     """``${scene:}``: the name of the data set's scene or folder, or of the choice where it has none."""
     node = _root_.get("dataset") or {}
@@ -49,6 +54,7 @@ def _scene(*, _root_: Node) -> str:
 
 
 OmegaConf.register_new_resolver("by_geometry", _by_geometry, replace=True)
+OmegaConf.register_new_resolver("by_budget", _by_budget, replace=True)
 OmegaConf.register_new_resolver("scene", _scene, replace=True)
 
 
@@ -74,8 +80,8 @@ def build(settings: type[T], node: Mapping[str, Any], key: str, also: Iterable[s
         there = [*_known(settings, error.full_key), *(() if "." in error.full_key else also)]
         raise unknown_key(_below(key, error.full_key), there) from error
     except MissingMandatoryValue as error:
-        told = filter(None, ("a value", meanings(settings).get(error.full_key)))
-        raise ConfigError(_below(key, error.full_key), Words("nothing"), ": ".join(told)) from error
+        parts = filter(None, ("a value", meanings(settings).get(error.full_key)))
+        raise ConfigError(_below(key, error.full_key), Words("nothing"), ": ".join(parts)) from error
     except OmegaConfBaseException as error:
         # An interpolation's message; its other lines repeat the key and name our classes.
         why = str(error.msg).splitlines()[0]
@@ -90,15 +96,15 @@ def pairs(arguments: Iterable[str]) -> dict[str, str]:
     Raises:
         CTMError: one has no value, or a key is given twice.
     """
-    found: dict[str, str] = {}
+    values: dict[str, str] = {}
     for argument in arguments:
         key, _, value = argument.partition("=")
         if not key or not value:
             raise CTMError(f"found {argument!r}, expected key=value")
-        if key in found:
+        if key in values:
             raise ConfigError(key, argument, "a key given once")
-        found[key] = value
-    return found
+        values[key] = value
+    return values
 
 
 def unknown_key(key: str, known: Iterable[str], everywhere: Iterable[str] = ()) -> ConfigError:
@@ -119,7 +125,7 @@ def unknown_key(key: str, known: Iterable[str], everywhere: Iterable[str] = ()) 
 def unknown_choice(group: str, choice: str, known: Sequence[str]) -> ConfigError:
     """Make the error for a choice that a group does not have, with the one that was meant likewise."""
     word = choice.lower()
-    meant = [name for name in known for words in (NO, YES) if name in words and word in words]
+    meant = [name for name in known for words in (NO_WORDS, YES_WORDS) if name in words and word in words]
     return ConfigError(group, choice, f"one of {', '.join(known)}{asked(meant or near_to(choice, known))}")
 
 

@@ -31,12 +31,13 @@ ctm VERB ...                                one of these; ctm VERB --help says m
 
 ctm is python -m ctm_plugin for short.
 """
+"""Usage of the command line."""
 TRAINING = "training"
-FLAGS = shlex.split("""-m --multirun -r --run -c --cfg -p --package --resolve -i --info -cd --config-dir -cp
-    --config-path -cn --config-name -sc --shell-completion --hydra-help --experimental-rerun""")
-"""Hydra's own, which may have a value after them."""
-ALONE = shlex.split("-m --multirun -r --run -c --cfg -i --info -sc --shell-completion")
-"""Of these it takes one."""
+HYDRA_FLAGS = shlex.split("""-m --multirun -r --run -c --cfg -p --package --resolve -i --info -cd --config-dir -cp
+    --config-path -cn --config-name --hydra-help""")
+"""Hydra's own flags, which may have a value after them."""
+BARE_FLAGS = shlex.split("-m --multirun -r --run -c --cfg -i --info")
+"""Those of them of which one may be given."""
 
 
 class UsageError(CTMError):
@@ -109,13 +110,13 @@ VERBS = {
     ),
 }  # fmt: skip
 VERBS_OF_OTHERS = Registry("command", "ctm_plugin.verbs", {})
-APART = {"scenes": "docs/examples/ctm_scenes"}
+EXAMPLE_VERBS = {"scenes": "docs/examples/ctm_scenes"}
 """Verbs of examples, and where these are in the checkout."""
 
 
 def names() -> list[str]:
     """List all verbs: ours, those of installed packages, and those of examples that are not installed."""
-    return [*VERBS, *sorted({*VERBS_OF_OTHERS.names(), *APART} - VERBS.keys())]
+    return [*VERBS, *sorted({*VERBS_OF_OTHERS.names(), *EXAMPLE_VERBS} - VERBS.keys())]
 
 
 def verb_of(name: str) -> Verb:
@@ -129,8 +130,8 @@ def verb_of(name: str) -> Verb:
         return VERBS[name]
     if name in VERBS_OF_OTHERS.names():
         return VERBS_OF_OTHERS.get(name)
-    if name in APART:
-        raise CTMError(f"ctm {name} is in a package of its own: pip install -e {APART[name]}")
+    if name in EXAMPLE_VERBS:
+        raise CTMError(f"ctm {name} is in a package of its own: pip install -e {EXAMPLE_VERBS[name]}")
     meant = near_to(name, names())
     if os.path.isdir(name):
         meant = [f"ctm {verb} {shlex.quote(name)}" for verb in ("photos", "train")]
@@ -224,13 +225,13 @@ def check_form(arguments: Sequence[str]) -> None:
     for before, argument, after in zip(["", *arguments], arguments, [*arguments[1:], ""], strict=False):
         key, equals, value = argument.partition("=")
         if argument.startswith("-"):
-            if key not in FLAGS:
+            if key not in HYDRA_FLAGS:
                 raise UsageError(f"found {argument!r}, expected {key.lstrip('-')}={value or 'VALUE'}")
         elif after.startswith("=") or (argument.endswith("=") and after and "=" not in after):
             raise UsageError(f"found {f'{argument} {after}'!r}, expected key=value, without spaces round the =")
-        elif not equals and not key.startswith("~") and before not in FLAGS:
+        elif not equals and not key.startswith("~") and before not in HYDRA_FLAGS:
             raise UsageError(f"found {argument!r}, expected key=value")
-    if len(given := dict.fromkeys(flag for each in arguments if (flag := each.partition("=")[0]) in ALONE)) > 1:
+    if len(given := dict.fromkeys(flag for each in arguments if (flag := each.partition("=")[0]) in BARE_FLAGS)) > 1:
         raise UsageError(f"found {' with '.join(given)}, expected one of these")
 
 
@@ -250,7 +251,7 @@ def _summary(name: str) -> str:
 def described(kind: type) -> list[tuple[str, str, str]]:
     """Tell name, default and meaning of each field of a dataclass."""
     values, words = dict(leaves(defaults(kind))), {"???": "needed", "None": ""}
-    return [(key, words.get(str(values[key]), str(values[key]).lower()), told) for key, told in meanings(kind).items()]
+    return [(key, words.get(str(values[key]), str(values[key]).lower()), text) for key, text in meanings(kind).items()]
 
 
 def _runs(words: Sequence[str], verb: Verb) -> Iterator[Path]:

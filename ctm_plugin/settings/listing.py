@@ -17,27 +17,26 @@ from ctm_plugin.settings.registry import METRICS_OF_OTHERS, REGISTRIES
 
 def plain(docstring: str, code: str = "") -> str:
     """What a docstring tells users, without its sections of arguments and errors; ``code`` goes round names in it."""
-    said = re.split(r"\n\n(?:Args|Attributes|Returns|Raises):", docstring)[0]
-    return re.sub(r":\w+:`~?(?:\w+\.)*(\w+)`", rf"{code}\1{code}", said).replace("``", code)
+    text = re.split(r"\n\n(?:Args|Attributes|Returns|Raises):", docstring)[0]
+    return re.sub(r":\w+:`~?(?:\w+\.)*(\w+)`", rf"{code}\1{code}", text).replace("``", code)
 
 
 def names(conf: Path, group: str) -> list[str]:
     """Find the names of a group's choices: its files, and what its registry has."""
-    found = {path.stem for path in (conf / group).glob("*.yaml")}
+    stems = {path.stem for path in (conf / group).glob("*.yaml")}
     if registry := REGISTRIES.get(group):
-        files = group in ("ctm", "callbacks")  # on and its variants, and all of ours together, are files
-        found |= {*registry.others(), *registry.added, *(() if files else registry.ours)}
-    return sorted(found)
+        stems |= {*registry.others(), *registry.added, *(() if group == "callbacks" else registry.ours)}
+    return sorted(stems - {"ctm"})  # on and its variants are files
 
 
 def choices(conf: Path, group: str) -> dict[str, str]:
     """Tell a line on each choice of a group: the first comment of its file, or what its registry says."""
-    told = {}
+    lines = {}
     for name in names(conf, group):
         path = conf / group / f"{name}.yaml"
         line = first_comment(path) if path.is_file() else plain(REGISTRIES[group].about(name)).partition("\n")[0]
-        told[name] = line.split(". ")[0].rstrip(".")
-    return told
+        lines[name] = line.split(". ")[0].rstrip(".")
+    return lines
 
 
 def first_comment(path: Path) -> str:

@@ -9,7 +9,7 @@ What is registered must be:
 
 - a data set: a dataclass, its settings, with a method ``load() -> Scene``;
 - a backbone: a :class:`ctm_plugin.backbones.base.Backbone` with a dataclass ``Config``, its settings, called with
-  ``(config, scene, channels, photometric, seed)``;
+  ``(config, scene, transform, photometric, seed)``;
 - a colour space: a :class:`ctm_plugin.color.transform.ColorTransform` without parameters, called with ``(config)``,
   its dataclass ``Config``; one of ours is a file in ``color/spaces/``, which imports its ``Config``;
 - a colour transform, a learned space: the same with parameters;
@@ -40,6 +40,13 @@ from ctm_plugin.errors import CTMError, UnknownNameError
 PACKAGE = Path(__file__).parents[1]
 
 
+def conf_dir() -> Path:
+    """Find ``conf/`` inside the package, where a wheel puts it, or next to it, in a checkout."""
+    package = PACKAGE.resolve()
+    inside, beside = package / "conf", package.parent / "conf"
+    return inside if inside.is_dir() else beside
+
+
 def entry_points(group: str) -> EntryPoints:
     """Find the entry points of installed packages; metadata are read again where a folder of theirs has changed."""
     folders = [path for folder in sys.path if (path := Path(folder).absolute()).exists()]
@@ -58,14 +65,12 @@ class Registry:
         kind: what they are, for messages.
         group: the entry-point group.
         ours: ``name -> "module:attribute"``.
-        kinds: the same of the dataclasses of settings that ours have, in modules that need no torch.
     """
 
-    def __init__(self, kind: str, group: str, ours: dict[str, str], kinds: dict[str, str] | None = None):
+    def __init__(self, kind: str, group: str, ours: dict[str, str]):
         self.kind = kind
         self.group = group
         self.ours = ours
-        self.kinds = kinds or {}
         self.added: dict[str, Any] = {}
 
     def others(self) -> dict[str, Any]:  # where a package (MLflow) imports importlib_metadata, its EntryPoint
@@ -82,7 +87,7 @@ class Registry:
             CTMError: see :meth:`get`.
         """
         if name in self.ours and name not in self.added:
-            return load(self.kinds.get(name) or config_of(self.ours[name]))
+            return load(config_of(self.ours[name]))
         thing = self.get(name)
         return getattr(thing, "Config", thing)
 
@@ -90,7 +95,8 @@ class Registry:
         """Read what one of ours says of itself, without importing it; or whose package another's is."""
         if name in self.ours:
             own, module = self.ours[name], self.ours[name].partition(":")[0]
-            return said_by(own) or said_by(self.kinds.get(name, module)) or said_by(module)
+            settings = config_of(own).removeprefix(NOTHING)
+            return said_by(own) or (settings and said_by(settings)) or said_by(module)
         if name in self.added:
             return "from this program"
         entry = self.others()[name]
@@ -101,8 +107,8 @@ class Registry:
         if name in self.ours:
             return self.about(name)
         thing = self.get(name)
-        said = inspect.cleandoc(thing.__doc__ or "")
-        return "" if said.startswith(f"{thing.__name__}(") else said  # a dataclass's own, its signature
+        text = inspect.cleandoc(thing.__doc__ or "")
+        return "" if text.startswith(f"{thing.__name__}(") else text  # a dataclass's own, its signature
 
     def register(self, name: str, thing: Any) -> None:
         """Add something from a running program, without a package.
@@ -144,27 +150,25 @@ BACKBONES = Registry(
         "ngp": "ctm_plugin.backbones.ngp:NGP",
         "splat": "ctm_plugin.backbones.splat:Splat",
     },
-    {
-        name.lower(): f"ctm_plugin.backbones.settings:{name}Config"
-        for name in ("BARF2D", "DVGO", "NeRF", "NGP", "Splat")
-    },
 )
-_DATASETS = {
-    "blender": "blender:Blender", "colmap": "colmap:Colmap", "llff": "llff:LLFF", "planar": "planar:Planar",
-    "rawnerf": "rawnerf:RawNeRF", "still_life": "embedded:StillLife", "transforms": "transforms:Transforms",
-    "white_room": "embedded:WhiteRoom",
-}  # fmt: skip
 DATASETS = Registry(
     "dataset",
     "ctm_plugin.datasets",
-    {name: f"ctm_plugin.data.{entry}Config" for name, entry in _DATASETS.items()},
-    {name: f"ctm_plugin.data.settings:{entry.partition(':')[2]}Settings" for name, entry in _DATASETS.items()},
+    {
+        "blender": "ctm_plugin.data.blender:BlenderConfig",
+        "colmap": "ctm_plugin.data.colmap:ColmapConfig",
+        "llff": "ctm_plugin.data.llff:LLFFConfig",
+        "planar": "ctm_plugin.data.planar:PlanarConfig",
+        "rawnerf": "ctm_plugin.data.rawnerf:RawNeRFConfig",
+        "still_life": "ctm_plugin.data.embedded:StillLifeConfig",
+        "transforms": "ctm_plugin.data.transforms:TransformsConfig",
+        "white_room": "ctm_plugin.data.embedded:WhiteRoomConfig",
+    },
 )
 TRANSFORMS = Registry(
     "colour transform",
     "ctm_plugin.color_transforms",
     {"auto": "ctm_plugin.color.auto:Auto", "ctm": "ctm_plugin.color.ctm:CTM"},
-    {"auto": "ctm_plugin.color.settings:AutoConfig", "ctm": "ctm_plugin.color.settings:CTMConfig"},
 )
 COLOR_SPACES = Registry(
     "color_space",
@@ -174,20 +178,13 @@ COLOR_SPACES = Registry(
 APPEARANCES = Registry(
     "appearance",
     "ctm_plugin.appearances",
-    {name.lower(): f"ctm_plugin.appearance.{name.lower()}:{name}" for name in ("Exposure", "Affine", "Bilateral")},
-    {name.lower(): f"ctm_plugin.appearance.settings:{name}Config" for name in ("Exposure", "Affine", "Bilateral")},
+    {"exposure": "ctm_plugin.appearance.exposure:Exposure"},
 )
 METRICS_OF_OTHERS = Registry("metric", "ctm_plugin.metrics", {})
 LOGGERS = Registry(
     "logger",
     "ctm_plugin.loggers",
-    {
-        "csv": "ctm_plugin.loggers.services:CSV",
-        "mlflow": "ctm_plugin.loggers.services:MLflow",
-        "tensorboard": "ctm_plugin.loggers.services:TensorBoard",
-        "wandb": "ctm_plugin.loggers.services:WandB",
-    },
-    {"mlflow": "ctm_plugin.loggers.settings:MLflowConfig", "wandb": "ctm_plugin.loggers.settings:WandBConfig"},
+    {name.lower(): f"ctm_plugin.loggers.services:{name}" for name in ("CSV", "MLflow", "TensorBoard", "WandB")},
 )
 CALLBACKS = Registry(
     "callback",
@@ -196,10 +193,6 @@ CALLBACKS = Registry(
         "progress": "ctm_plugin.callbacks.progress:ProgressLine",
         "dashboard": "ctm_plugin.callbacks.dashboard:Dashboard",
         "film": "ctm_plugin.callbacks.film:Film",
-    },
-    {
-        "dashboard": "ctm_plugin.callbacks.settings:DashboardConfig",
-        "film": "ctm_plugin.callbacks.settings:FilmConfig",
     },
 )
 REGISTRIES = {
@@ -211,15 +204,17 @@ REGISTRIES = {
     "logger": LOGGERS,
     "callbacks": CALLBACKS,
 }
-"""By config group."""
-SETTINGS = {
+"""Registries by config group."""
+PRESET_SETTINGS = {
     "loss": "ctm_plugin.color.settings:LossConfig",
     "trainer": "ctm_plugin.runs.settings:TrainerConfig",
     "metrics": "ctm_plugin.metrics.settings:MetricsConfig",
 }
 """Dataclasses of the groups whose choices differ only in values."""
-TRAINING = "ctm_plugin.color.settings:TransformTraining"
-"""The settings that all of ``ctm`` share."""
+NOTHING = "ctm_plugin.settings.setting:Nothing"
+"""Dataclass of what has no settings."""
+CTM_SETTINGS = "ctm_plugin.color.settings:TransformTraining"
+"""Dataclass of the settings that all choices of ``ctm`` share."""
 
 
 def load(entry: str) -> Any:
@@ -236,15 +231,20 @@ def said_by(entry: str) -> str:
 
 @functools.cache
 def config_of(entry: str) -> str:
-    """Find the ``module:dataclass`` that a class calls its ``Config``, without importing either."""
+    """Find the ``module:dataclass`` of a class's settings, without importing either.
+
+    It is what the class calls its ``Config``, else the class itself where it is a dataclass with fields, else the first
+    of its bases that comes from a module ``settings``, which needs no torch.
+    """
     own, tree = parsed(entry)
-    given = (node for node in own.body if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "Config")
-    if (node := next(given, None)) is None:
-        return "ctm_plugin.settings.setting:Nothing"
-    name = ast.unparse(node.value)
     imports = (each for each in tree.body if isinstance(each, ast.ImportFrom))
     homes = {alias.name: each.module for each in imports for alias in each.names}
-    return f"{homes.get(name, entry.partition(':')[0])}:{name}"
+    given = (node for node in own.body if isinstance(node, ast.Assign | ast.AnnAssign) and node.value)
+    names = [ast.unparse(node.value) for node in given if ast.unparse(node).startswith(("Config =", "Config:"))]
+    if any(isinstance(node, ast.AnnAssign) for node in own.body) and own.decorator_list:
+        names.append(own.name)
+    names += [base for base in map(ast.unparse, own.bases) if homes.get(base, "").endswith(".settings")]
+    return f"{homes.get(names[0], entry.partition(':')[0])}:{names[0]}" if names else NOTHING
 
 
 def parsed(entry: str) -> tuple[Any, ast.Module]:

@@ -13,10 +13,10 @@ from omegaconf import OmegaConf
 from ctm_plugin.errors import ConfigError
 
 Number = float | int
-"""What a configuration file may hold for a real number: ``exposure: 1`` is an int."""
+"""A real number in a configuration file: ``exposure: 1`` is an int."""
 REQUIRED: Any = MISSING
 """The default of a :func:`setting` that must be given."""
-MOST = 2**31 - 1
+MAX_INT = 2**31 - 1
 """Largest integer of any setting."""
 RULES = ("least", "most", "above", "below", "choices")
 
@@ -52,7 +52,7 @@ class Allowed(NamedTuple):
 
     def _range(self) -> str:
         what = "an integer" if self.integer else "a number"
-        if self.high is None or (self.integer and self.high == MOST):
+        if self.high is None or (self.integer and self.high == MAX_INT):
             return f"{what} {'>' if self.open_low else '>='} {self.low:.10g}"
         if self.integer:
             return f"{what}, {self.low} to {self.high}"
@@ -73,8 +73,8 @@ def setting(default: Any, meaning: str, *, composed: str | None = None, **allowe
     """
     if unknown := set(allowed) - set(RULES):
         raise TypeError(f"setting() got {', '.join(sorted(unknown))}, expected some of {', '.join(RULES)}")
-    said = {"meaning": meaning, "composed": composed, "allowed": allowed}
-    return field(default=default, metadata={name: value for name, value in said.items() if value})
+    metadata = {"meaning": meaning, "composed": composed, "allowed": allowed}
+    return field(default=default, metadata={name: value for name, value in metadata.items() if value})
 
 
 def by_geometry(bounded: Any, other: Any, meaning: str, **allowed: Any) -> Any:
@@ -96,7 +96,7 @@ class Settings:
     """
 
     section: ClassVar[str] = ""
-    """Where its keys stand in a configuration, for messages."""
+    """Section of the configuration that holds its keys, for messages."""
 
     def __init_subclass__(cls, section: str | None = None, **more: Any) -> None:
         super().__init_subclass__(**more)
@@ -123,17 +123,17 @@ class Nothing(Settings):
 @functools.cache
 def rules(settings: type) -> dict[str, Allowed]:
     """Find what the keys of a dataclass may be, where they say so."""
-    hints, found = get_type_hints(settings), {}
+    hints, allowed = get_type_hints(settings), {}
     for each in fields(settings):
         if given := _said(settings, each.name, "allowed"):
             kinds = get_args(hints[each.name]) or (hints[each.name],)
             integer = int in kinds and float not in kinds
             low, high = given.get("least", given.get("above")), given.get("most", given.get("below"))
             if low is not None and integer and high is None:
-                high = MOST
+                high = MAX_INT
             ends = "above" in given, "below" in given
-            found[each.name] = Allowed(integer, NoneType in kinds, low, high, *ends, tuple(given.get("choices", ())))
-    return found
+            allowed[each.name] = Allowed(integer, NoneType in kinds, low, high, *ends, tuple(given.get("choices", ())))
+    return allowed
 
 
 @functools.cache
@@ -149,13 +149,13 @@ def defaults(settings: type) -> dict[str, Any]:
 
 def meanings(settings: type) -> dict[str, str]:
     """Tell what each key of a dataclass means, by dotted name; a field that does not say has the words of a base's."""
-    told = {}
+    texts = {}
     for each in fields(settings):
         meaning = _said(settings, each.name, "meaning") or ""
         inner = meanings(type(each.default)) if is_dataclass(each.default) else {}
-        told |= {f"{each.name}.{name}": ": ".join(filter(None, (meaning, words))) for name, words in inner.items()}
-        told |= {} if inner else {each.name: meaning}
-    return told
+        texts |= {f"{each.name}.{name}": ": ".join(filter(None, (meaning, words))) for name, words in inner.items()}
+        texts |= {} if inner else {each.name: meaning}
+    return texts
 
 
 def keys(settings: type) -> list[str]:

@@ -14,9 +14,9 @@ from rich.progress import BarColumn, Progress, ProgressColumn, TextColumn, TimeE
 
 T = TypeVar("T")
 Update = Callable[..., None]
-"""Told how many are done, a word on them, and how many seconds are left, where that is known."""
-SMOOTH = 20.0
-"""Seconds in which a new guess of when all is done takes the place of an old one."""
+"""Called with how many are done, a word on them, and the seconds left where they are known."""
+SMOOTHING_S = 20.0
+"""Seconds over which a new guess of the end replaces an old one."""
 
 
 def error_console() -> Console:
@@ -52,7 +52,7 @@ class Whole:
         if left is None:
             left = planned * (1 - share) ** 2 + (now - self.since) * (1 - share)
         end = now + left + total - self.begun[what] - planned
-        self.end = end if self.told is None else self.end + (end - self.end) * min((now - self.told) / SMOOTH, 1.0)
+        self.end = end if self.told is None else self.end + (end - self.end) * min((now - self.told) / SMOOTHING_S, 1.0)
         self.told = now
         eta = f"{timedelta(seconds=round(max(self.end - now, 0)))} left"
         done = self.begun[what] + planned * share

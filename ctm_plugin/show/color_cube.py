@@ -15,14 +15,15 @@ from ctm_plugin.color.light import AS_IS, Light
 from ctm_plugin.color.transform import ColorTransform
 from ctm_plugin.show.pictures import below, beside, latent_picture
 
-SIDE = 128
-LATTICE = 9
-DOT = 2
+PICTURE_SIDE = 128
+"""Side of the picture in pixels, points along an edge of the cube, and radius of a dot in pixels."""
+LATTICE_POINTS = 9
+DOT_RADIUS = 2
 AROUND, ABOVE = math.radians(25), math.radians(25)
 RIGHT = torch.tensor([-math.sin(AROUND), math.cos(AROUND), 0.0])
 NEAR = torch.tensor([math.cos(ABOVE) * math.cos(AROUND), math.cos(ABOVE) * math.sin(AROUND), math.sin(ABOVE)])
 UP = torch.linalg.cross(NEAR, RIGHT)
-"""The viewer's axes: the first component comes nearer, the second goes to the right, the third up."""
+"""The viewer's axes: ``NEAR`` points to the viewer, ``RIGHT`` to the right, ``UP`` upwards."""
 
 
 @torch.no_grad()
@@ -39,7 +40,7 @@ def cube_picture(
         colors: sRGB in [0, 1], on the transform's device.
         light: of the scene.
     """
-    steps = torch.linspace(0, 1, LATTICE, device=colors.device)
+    steps = torch.linspace(0, 1, LATTICE_POINTS, device=colors.device)
     lattice = torch.cartesian_prod(steps, steps, steps)
     lit = light.apply(colors).cpu()
     rows = [
@@ -51,7 +52,7 @@ def cube_picture(
 
 def dots(places: Float[Tensor, "n 3"], colors: Float[Tensor, "n 3"]) -> Float[Tensor, "h w 3"]:
     """Dots in the unit cube, seen from outside, the nearer ones in front."""
-    canvas = Image.new("RGB", (SIDE, SIDE), (96, 96, 96))
+    canvas = Image.new("RGB", (PICTURE_SIDE, PICTURE_SIDE), (96, 96, 96))
     pen = ImageDraw.Draw(canvas)
     corners = torch.tensor(list(itertools.product((0.0, 1.0), repeat=3)))
     for a, b in itertools.combinations(range(8), 2):
@@ -60,11 +61,11 @@ def dots(places: Float[Tensor, "n 3"], colors: Float[Tensor, "n 3"]) -> Float[Te
     order = ((places - 0.5) @ NEAR).argsort()
     levels = (colors[order].clamp(0, 1) * 255).round().byte().tolist()
     for (x, y), color in zip(_seen(places[order]).tolist(), levels, strict=True):
-        pen.ellipse((x - DOT, y - DOT, x + DOT, y + DOT), fill=tuple(color))
+        pen.ellipse((x - DOT_RADIUS, y - DOT_RADIUS, x + DOT_RADIUS, y + DOT_RADIUS), fill=tuple(color))
     return torch.from_numpy(np.array(canvas)).float() / 255
 
 
 def _seen(points: Float[Tensor, "n 3"]) -> Float[Tensor, "n 2"]:
     """Where points of the unit cube are in the picture, in pixels."""
     centred = points - 0.5
-    return SIDE * (0.5 + 0.6 * torch.stack([centred @ RIGHT, -(centred @ UP)], dim=1))
+    return PICTURE_SIDE * (0.5 + 0.6 * torch.stack([centred @ RIGHT, -(centred @ UP)], dim=1))

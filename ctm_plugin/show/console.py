@@ -38,8 +38,8 @@ def table_for(console: Console, **settings: Any) -> Table:
 def texts(metrics: dict[str, Any], place: str) -> dict[str, str]:
     """Write the scores that a person reads at a place (see :func:`told_at`) as text, by their names."""
     alike = metrics.get("appearance") == "none"
-    told = {name: metric for name, metric in told_at(place).items() if not (alike and metric.differing)}
-    return {name: metric.text(metrics[name]) for name, metric in told.items() if metrics.get(name) is not None}
+    entries = {name: metric for name, metric in told_at(place).items() if not (alike and metric.differing)}
+    return {name: metric.text(metrics[name]) for name, metric in entries.items() if metrics.get(name) is not None}
 
 
 def print_next(verb: str, path: Path) -> None:
@@ -75,10 +75,10 @@ def print_summary(metrics: dict[str, Any], folder: Path, run: Path | None = None
 
 def print_line(metrics: dict[str, Any], folder: Path, before: str = "") -> None:
     """Print one run of a sweep in one line."""
-    told = [f"{METRICS[name].label} {text}" for name, text in texts(metrics, "sweep").items()]
+    parts = [f"{METRICS[name].label} {text}" for name, text in texts(metrics, "sweep").items()]
     if metrics.get("converged") is False:
-        told.append("not converged")
-    line = "  ".join([*told, f"written to {folder}"])
+        parts.append("not converged")
+    line = "  ".join([*parts, f"written to {folder}"])
     output_console().print(f"{before}{line}", soft_wrap=True, highlight=False, markup=False)
 
 

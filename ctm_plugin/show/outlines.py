@@ -10,8 +10,8 @@ from torch import Tensor
 
 from ctm_plugin.rays.homography import patch_corners, sl3_exp, to_pixels, warp
 
-COLORS = ("#e6194b", "#42d4f4", "#f032e6", "#ffe119", "#3cb44b")
-"""Of the patches' outlines."""
+OUTLINE_COLORS = ("#e6194b", "#42d4f4", "#f032e6", "#ffe119", "#3cb44b")
+"""Colours of the patches' outlines."""
 
 
 def outlines(
@@ -22,7 +22,7 @@ def outlines(
     canvas = Image.fromarray((picture.clamp(0, 1) * 255).round().byte().numpy())
     pen = ImageDraw.Draw(canvas)
     corners = patch_corners(height, width, patch)
-    for of_all, colors, thick in ((true_warps, ["white"] * len(warps), 1), (warps, COLORS, 3)):
+    for of_all, colors, thick in ((true_warps, ["white"] * len(warps), 1), (warps, OUTLINE_COLORS, 3)):
         quads = to_pixels(warp(corners, sl3_exp(of_all)), height, width) - 0.5
         for quad, color in zip(quads.tolist(), colors, strict=True):
             pen.line([tuple(point) for point in [*quad, quad[0]]], fill=color, width=thick, joint="curve")

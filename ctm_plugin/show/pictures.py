@@ -5,10 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 import matplotlib
-import numpy as np
 import torch
 from jaxtyping import Float
-from PIL import Image, ImageDraw, ImageFont
+from PIL import Image
 from torch import Tensor
 
 from ctm_plugin.files import replacing
@@ -54,13 +53,6 @@ def beside(*pictures: Float[Tensor, "h w 3"], gap: int = 2) -> Float[Tensor, "h 
 def below(*pictures: Float[Tensor, "h w 3"], gap: int = 2) -> Float[Tensor, "x w 3"]:
     """Pictures of one width in a column, with a white gap."""
     return beside(*[picture.transpose(0, 1) for picture in pictures], gap=gap).transpose(0, 1)
-
-
-def labelled(picture: Float[Tensor, "h w 3"], text: str, height: int = 24) -> Float[Tensor, "x w 3"]:
-    """A picture with a line of text above it, black on white."""
-    strip = Image.new("RGB", (picture.shape[1], height), "white")
-    ImageDraw.Draw(strip).text((2, 2), text, fill="black", font=ImageFont.load_default(0.7 * height))
-    return torch.cat([torch.from_numpy(np.asarray(strip) / np.float32(255)), picture.cpu()])
 
 
 def write_png(path: Path, picture: Float[Tensor, "h w 3"]) -> None:

@@ -9,10 +9,11 @@ from jaxtyping import Float, Int, UInt8
 
 from ctm_plugin.files import replacing
 
-VERTEX = np.dtype(
+VERTEX_TYPE = np.dtype(
     [(name, "<f4") for name in ("x", "y", "z", "nx", "ny", "nz")] + [(c, "u1") for c in ("red", "green", "blue")]
 )
-FACE = np.dtype([("count", "u1"), ("corners", "<i4", 3)])
+"""Binary layout of a vertex and of a face."""
+FACE_TYPE = np.dtype([("count", "u1"), ("corners", "<i4", 3)])
 
 
 def write_ply(
@@ -30,18 +31,18 @@ def write_ply(
         colors: sRGB.
         faces: triples of vertices, counter-clockwise from outside; ``None``: a cloud of points.
     """
-    vertices = np.empty(len(points), VERTEX)
+    vertices = np.empty(len(points), VERTEX_TYPE)
     for names, values in ((("x", "y", "z"), points), (("nx", "ny", "nz"), normals), (("red", "green", "blue"), colors)):
         for name, column in zip(names, values.T, strict=True):
             vertices[name] = column
     kinds = {"<f4": "float", "|u1": "uchar"}
     head = ["ply", "format binary_little_endian 1.0", f"element vertex {len(points)}"]
-    head += [f"property {kinds[VERTEX[name].str]} {name}" for name in VERTEX.names]
+    head += [f"property {kinds[VERTEX_TYPE[name].str]} {name}" for name in VERTEX_TYPE.names]
     if faces is not None:
         head += [f"element face {len(faces)}", "property list uchar int vertex_indices"]
     body = vertices.tobytes()
     if faces is not None:
-        triangles = np.empty(len(faces), FACE)
+        triangles = np.empty(len(faces), FACE_TYPE)
         triangles["count"], triangles["corners"] = 3, faces
         body += triangles.tobytes()
     with replacing(path) as beside:

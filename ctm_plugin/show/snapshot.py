@@ -14,7 +14,8 @@ from ctm_plugin.show.pictures import beside, error_picture, latent_picture
 
 @dataclass
 class Snapshot:
-    """Pictures ``[H, W, 3]``, latents ``[..., k]`` and scores, by the names that loggers have for them; on the CPU."""
+    """Pictures ``[H, W, 3]`` and latents ``[..., k]`` by the names that loggers have for them, scores by those of
+    :data:`METRICS`; on the CPU."""
 
     pictures: dict[str, Tensor] = field(default_factory=dict)
     latents: dict[str, Tensor] = field(default_factory=dict)
@@ -49,7 +50,7 @@ def compared(
     shown.pictures["test/error"] = error_picture((render - target).abs().mean(-1), float(target.max()) / 4)
     gain = enhancement_gain([target], exposure)
     view = View(render, target, gain, mask=mask)
-    for metric in METRICS.values():
+    for name, metric in METRICS.items():
         if metric.curve and (gain > 1 or not metric.dark):
-            shown.scores[metric.curve[0]] = metric.view(view)
+            shown.scores[name] = metric.view(view)
     return shown

@@ -10,16 +10,16 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-FIRST = 5.0
-"""From the first camera to what it looks at, in the viewer's units: covariances are of 16 bits there."""
-WIDEST = 250.0
-"""Largest standard deviation in the viewer's units: the square of 256 has no place in 16 bits."""
-FOR_FILES = """<head><script>
+FIRST_DISTANCE = 5.0
+"""Distance from the first camera to what it looks at, in the viewer's units; they keep covariances within 16 bits."""
+MAX_SIGMA = 250.0
+"""Largest standard deviation in the viewer's units: the square of 256 does not fit in 16 bits."""
+FILE_SCRIPT = """<head><script>
 // Pages that are opened as files may not start module workers from blobs: without one, viser takes a data address.
 const made = URL.createObjectURL;
 URL.createObjectURL = (of) => of.type?.startsWith("text/javascript") ? "" : made.call(URL, of);
 </script><style>:has(> [aria-label$="scene tree"]) { display: none !important }</style>"""
-"""What is added to viser's page. Its sorting of Gaussians by depth is such a worker."""
+"""Script added to viser's page, which lets a page opened as a file start workers, such as viser's sorting by depth."""
 
 
 class Spots(NamedTuple):
@@ -54,9 +54,9 @@ def walk(spots: Spots, start: Start) -> str:
     """
     import viser
 
-    scale = FIRST / np.linalg.norm(start.ahead - start.eye)
+    scale = FIRST_DISTANCE / np.linalg.norm(start.ahead - start.eye)
     axes = scale * spots.axes
-    axes = axes * np.minimum(1, WIDEST / np.linalg.norm(axes, axis=1, keepdims=True).clip(1e-12))
+    axes = axes * np.minimum(1, MAX_SIGMA / np.linalg.norm(axes, axis=1, keepdims=True).clip(1e-12))
     with redirect_stdout(io.StringIO()), warnings.catch_warnings():
         warnings.simplefilter("ignore")  # that nobody listens
         server = viser.ViserServer("127.0.0.1", 0, verbose=False)
@@ -68,4 +68,4 @@ def walk(spots: Spots, start: Start) -> str:
         camera = server.initial_camera
         camera.position, camera.look_at = scale * start.eye, scale * start.ahead
         camera.up, camera.fov = start.up, start.fov
-        return server.scene.as_html(dark_mode=True).replace("<head>", FOR_FILES, 1)
+        return server.scene.as_html(dark_mode=True).replace("<head>", FILE_SCRIPT, 1)

@@ -1,4 +1,4 @@
-"""Gaussians of space on their way to a picture: projection through a lens, colours seen from the camera."""
+"""3D Gaussians: their projection through a lens, and their colours from a camera's direction."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from ctm_plugin.rays.cameras import distort, distortion_slopes, undistort
 from ctm_plugin.rays.spherical_harmonics import harmonics
 from ctm_plugin.scene.views import Views
 
-BLUR = 0.3
-"""Variance, in pixels squared, that pictures add to each Gaussian: none is narrower than a pixel (3DGS)."""
-LEAST = 1 / 255
-"""Alpha below which a Gaussian does not change a pixel."""
-MOST = 0.99
-"""The largest alpha of one Gaussian."""
-AROUND = 1.3, 1.05
-"""How far beyond the frame the projection follows the camera, in frames: of pinholes, and of lenses, whose polynomial
-folds over further out. From there on it is straight."""
+EPS2D = 0.3
+"""Variance in pixels squared that is added to each projected Gaussian: none is narrower than a pixel (3DGS)."""
+MIN_ALPHA = 1 / 255
+"""Alpha below which a Gaussian does not change a pixel (3DGS)."""
+MAX_ALPHA = 0.99
+"""Largest alpha of one Gaussian (3DGS)."""
+FRAME_MARGINS = 1.3, 1.05
+"""Limits of a projection's slopes, in frames: of pinholes, and of lenses, whose polynomial folds further out. Beyond
+them the projection is linear."""
 
 
 class Gaussians(NamedTuple):
@@ -33,25 +33,25 @@ class Gaussians(NamedTuple):
 
     means: Float[Tensor, "n 3"]
     scales: Float[Tensor, "n 3"]
-    turns: Float[Tensor, "n 4"]
+    quats: Float[Tensor, "n 4"]
     """Quaternions (w, x, y, z) of any length > 0."""
     opacities: Float[Tensor, "n 1"]
-    base: Float[Tensor, "n k"]
-    """The coefficients of the constant harmonic."""
-    rest: Float[Tensor, "n rest"]
-    """Those of the B - 1 others, ``[N, (B - 1) k]``, one harmonic's channels after the other's."""
+    sh0: Float[Tensor, "n k"]
+    """Coefficients of the constant harmonic."""
+    shN: Float[Tensor, "n rest"]
+    """Coefficients of the B - 1 others, ``[N, (B - 1) k]``, channels of one harmonic after those of another."""
 
 
 class Camera(NamedTuple):
-    """Where a picture is taken from: OpenCV's axes (x right, y down, looking along z).
+    """Pose and lens of a picture; OpenCV's axes (x right, y down, looking along z).
 
     Attributes:
-        turn: world to camera.
+        turn: rotation from world to camera.
         centre: of the camera, in the world.
         lens: (fx, fy, cx, cy) in pixels, the first pixel's centre at (0.5, 0.5).
         distortion: (k1, k2, p1, p2, k3); zeros of a pinhole.
-        reach: up to which |x / z| and |y / z| the projection follows the lens.
-        near: what lies nearer along z is not shown.
+        reach: largest |x / z| and |y / z| where the projection follows the lens.
+        near: distance of the near plane along z.
         height, width: of the picture in pixels.
     """
 
@@ -70,7 +70,7 @@ class Camera(NamedTuple):
 
 
 def camera_of(views: Views, index: int, near: float, every: int = 1) -> Camera:
-    """Take a view's camera, for the pixels of every so many rows and columns, the first ones included."""
+    """A view's camera, for the pixels of each ``every``-th row and column, the first included."""
     c2w, lens = views.c2w[index].double(), views.intrinsics[index].double()
     height, width = -(-views.height // every), -(-views.width // every)
     lens = torch.cat([lens[:2] / every, (lens[2:] - 0.5) / every + 0.5])
@@ -80,12 +80,12 @@ def camera_of(views: Views, index: int, near: float, every: int = 1) -> Camera:
     rims = torch.cat([torch.stack(torch.broadcast_tensors(edge, edge.new_tensor(side)), 1) for side in (0.0, 1.0)])
     rims = torch.cat([rims, rims.flip(1)]) * -(-views.extents[index] // every).to(lens)
     across = torch.stack(undistort(*((rims - lens[2:]) / lens[:2]).unbind(1), distortion), 1)
-    reach = across.abs().amax(0) * AROUND[bool(distortion.any())]
+    reach = across.abs().amax(0) * FRAME_MARGINS[bool(distortion.any())]
     parts = (turn.contiguous(), c2w[:, 3].contiguous(), lens, distortion, reach)
     return Camera(*(part.float() for part in parts), near, height, width)
 
 
-class Projected(NamedTuple):
+class ProjectedGaussians(NamedTuple):
     """Gaussians on a picture.
 
     Attributes:
@@ -94,8 +94,8 @@ class Projected(NamedTuple):
         opacities: ``[N]``.
         colors: ``[N, k]``.
         depths: ``[N]`` along the camera's axis.
-        slopes: ``[N, 2]``, by how much the Gaussian's expected depth changes a pixel.
-        extents: ``[N, 2]`` half the width and the height, in pixels, of where alpha may reach 1/255; 0: not shown.
+        slopes: ``[N, 2]``, change of the Gaussian's expected depth a pixel.
+        extents: ``[N, 2]`` half the width and height in pixels of the area where alpha may reach 1/255; 0: invisible.
     """
 
     means: Tensor
@@ -107,9 +107,9 @@ class Projected(NamedTuple):
     extents: Tensor
 
 
-def rotations(turns: Float[Tensor, "n 4"]) -> Float[Tensor, "n 3 3"]:
+def rotations(quats: Float[Tensor, "n 4"]) -> Float[Tensor, "n 3 3"]:
     """Quaternions (w, x, y, z) of any length > 0 as matrices."""
-    w, x, y, z = F.normalize(turns, dim=-1).unbind(-1)
+    w, x, y, z = F.normalize(quats, dim=-1).unbind(-1)
     rows = (
         1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
         2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
@@ -125,13 +125,13 @@ def colors_seen(gaussians: Gaussians, centre: Tensor, degrees: int, floor: float
     """
     directions = F.normalize(gaussians.means.detach() - centre, dim=-1)
     basis = harmonics(directions, degrees)
-    channels = gaussians.base.shape[1]
-    rest = gaussians.rest.unflatten(1, (-1, channels))[:, : degrees**2 - 1]
-    seen = basis[:, :1] * gaussians.base + (basis[:, 1:, None] * rest).sum(1)
-    return (0.5 + seen).clamp_min(floor)
+    channels = gaussians.sh0.shape[1]
+    higher = gaussians.shN.unflatten(1, (-1, channels))[:, : degrees**2 - 1]
+    colors = basis[:, :1] * gaussians.sh0 + (basis[:, 1:, None] * higher).sum(1)
+    return (0.5 + colors).clamp_min(floor)
 
 
-def project(gaussians: Gaussians, camera: Camera, shift: Tensor, degrees: int, floor: float) -> Projected:
+def project(gaussians: Gaussians, camera: Camera, shift: Tensor, degrees: int, floor: float) -> ProjectedGaussians:
     """Project by the local affine map of the lens at each mean (EWA splatting, Zwicker et al. 2002).
 
     A Gaussian of covariance V in the camera's frame has ``J V J' + 0.3`` on the picture, J the derivative of the
@@ -139,7 +139,7 @@ def project(gaussians: Gaussians, camera: Camera, shift: Tensor, degrees: int, f
 
     Args:
         gaussians: N of them.
-        camera: who looks.
+        camera: pose and lens.
         shift: ``[N, 2]``, added to the means on the picture; its gradient is theirs.
         degrees, floor: see :func:`colors_seen`.
     """
@@ -165,18 +165,18 @@ def project(gaussians: Gaussians, camera: Camera, shift: Tensor, degrees: int, f
         ],
         dim=1,
     )
-    spread = rotations(gaussians.turns) * gaussians.scales.exp()[:, None, :]
+    spread = rotations(gaussians.quats) * gaussians.scales.exp()[:, None, :]
     rows = jacobian @ camera.turn @ spread
-    covariance = rows @ rows.transpose(1, 2) + BLUR * torch.eye(2, dtype=rows.dtype, device=rows.device)
+    covariance = rows @ rows.transpose(1, 2) + EPS2D * torch.eye(2, dtype=rows.dtype, device=rows.device)
     a, b, c = covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]
     conics = torch.stack([c, -b, a], 1) / (a * c - b * b)[:, None]
     opacities = gaussians.opacities[:, 0].sigmoid()
     with torch.no_grad():
         along = (rows @ (camera.turn[2] @ spread)[:, :, None])[:, :, 0]
         slopes = conics[:, :2] * along[:, :1] + conics[:, 1:] * along[:, 1:]
-        reach = 2 * (opacities / LEAST).log()
+        reach = 2 * (opacities / MIN_ALPHA).log()
         extents = (torch.stack([a, c], 1) * reach.clamp_min(0)[:, None]).sqrt() * there[:, None]
-    return Projected(
+    return ProjectedGaussians(
         means, conics, opacities, colors_seen(gaussians, camera.centre, degrees, floor), z, slopes, extents
     )
 

@@ -1,4 +1,4 @@
-"""More Gaussians where the picture pulls at them: 3DGS's adaptive density control."""
+"""3DGS's adaptive density control: duplicate, split and prune Gaussians by the gradients of their means."""
 
 from __future__ import annotations
 
@@ -11,12 +11,13 @@ from torch import Tensor
 
 from ctm_plugin.splats.gaussians import Gaussians, rotations
 
-LARGE = 0.01
-"""Standard deviation, in extents of the cameras, from which on a Gaussian is split; smaller ones get a twin."""
-FEWEST = 100
-"""Gaussians that stay where none shows enough: a field without any would never learn again."""
-SHRUNK = 1.6
-"""How much smaller the two are that one is split into."""
+GROW_SCALE3D = 0.01
+"""Standard deviation, in extents of the cameras, from which on a Gaussian is split; smaller ones are duplicated
+(gsplat's ``grow_scale3d``)."""
+MIN_GAUSSIANS = 100
+"""Least number of Gaussians that pruning leaves: a field without any would never learn again."""
+SPLIT_FACTOR = 1.6
+"""Ratio of the scale of a Gaussian to that of the two it is split into."""
 
 
 class Change(NamedTuple):
@@ -29,47 +30,47 @@ class Change(NamedTuple):
 @torch.no_grad()
 def densify(
     gaussians: Gaussians,
-    push: Float[Tensor, " n"],
-    threshold: float,
+    grad2d: Float[Tensor, " n"],
+    grow_grad2d: float,
     extent: float,
-    most: int,
-    pruned: float,
+    cap_max: int,
+    prune_opa: float,
     normal: Float[Tensor, "n 6"],
 ) -> Change:
-    """Give a twin to what is small, split what is large, where the pull is above a threshold; drop what hardly shows.
+    """Duplicate small Gaussians and split large ones where ``grad2d`` exceeds a threshold; prune transparent ones.
 
     Args:
         gaussians: N of them.
-        push: the mean length of the gradient of their means on the picture, in halves of its sides.
-        threshold: of ``push``; infinity: only drop.
+        grad2d: mean length of the gradient of the means on the picture, in halves of its sides.
+        grow_grad2d: threshold of ``grad2d``; infinity: only prune.
         extent: of the cameras, in scene units.
-        most: Gaussians at most; where more would come, those that are pulled at hardest go first.
-        pruned: opacity below which one is dropped.
-        normal: from N(0, 1), where the halves of a split one lie, in its own standard deviations.
+        cap_max: largest number of Gaussians; the largest ``grad2d`` goes first.
+        prune_opa: opacity below which one is pruned.
+        normal: draws from N(0, 1): offsets of the halves of a split one, in its standard deviations.
     """
-    stays = shows(gaussians, pruned)
-    grows = stays & (push > threshold)  # what goes would leave its twin, NaN and all
-    room = max(most - len(push), 0)
+    stays = shows(gaussians, prune_opa)
+    grows = stays & (grad2d > grow_grad2d)  # a pruned one would leave its duplicate, NaN and all
+    room = max(cap_max - len(grad2d), 0)
     if int(grows.sum()) > room:
-        grows &= push > push.where(grows, 0.0).sort(descending=True).values[room]
-    large = gaussians.scales.amax(1).exp() > LARGE * extent
-    twins, split = (grows & ~large).nonzero().squeeze(1), (grows & large).nonzero().squeeze(1)
+        grows &= grad2d > grad2d.where(grows, 0.0).sort(descending=True).values[room]
+    large = gaussians.scales.amax(1).exp() > GROW_SCALE3D * extent
+    duplicated, split = (grows & ~large).nonzero().squeeze(1), (grows & large).nonzero().squeeze(1)
     halves = Gaussians(*(table[split].repeat(2, 1) for table in gaussians))
-    away = normal[split].view(-1, 2, 3).transpose(0, 1).reshape(-1, 3) * halves.scales.exp()
+    offsets = normal[split].view(-1, 2, 3).transpose(0, 1).reshape(-1, 3) * halves.scales.exp()
     halves = halves._replace(
-        means=halves.means + (rotations(halves.turns) @ away[:, :, None])[:, :, 0],
-        scales=halves.scales - math.log(SHRUNK),
+        means=halves.means + (rotations(halves.quats) @ offsets[:, :, None])[:, :, 0],
+        scales=halves.scales - math.log(SPLIT_FACTOR),
     )
     stays[split] = False
-    added = Gaussians(*(torch.cat([table[twins], half]) for table, half in zip(gaussians, halves, strict=True)))
+    added = Gaussians(*(torch.cat([table[duplicated], half]) for table, half in zip(gaussians, halves, strict=True)))
     return Change(stays.nonzero().squeeze(1), added)
 
 
-def shows(gaussians: Gaussians, pruned: float) -> Bool[Tensor, " n"]:
-    """Tell which Gaussians are finite and at least so opaque; where none is, which are the most opaque."""
+def shows(gaussians: Gaussians, prune_opa: float) -> Bool[Tensor, " n"]:
+    """Tell which Gaussians are finite and as opaque as ``prune_opa``; if none is, the most opaque ones."""
     finite = torch.stack([table.isfinite().all(1) for table in gaussians]).all(0)
     opacities = torch.where(finite, gaussians.opacities[:, 0].sigmoid(), -1.0)
-    shown = opacities >= pruned
-    if not shown.any() and len(shown):
-        shown = finite & (opacities >= opacities.topk(min(FEWEST, len(shown))).values[-1])
-    return shown
+    kept = opacities >= prune_opa
+    if not kept.any() and len(kept):
+        kept = finite & (opacities >= opacities.topk(min(MIN_GAUSSIANS, len(kept))).values[-1])
+    return kept

@@ -2,33 +2,28 @@
 
 from __future__ import annotations
 
-import functools
-import importlib.util
-import warnings
-from contextlib import suppress
-
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from ctm_plugin.door import looped
-from ctm_plugin.splats.gaussians import LEAST, MOST, Camera, Gaussians, Projected, project, secants
+from ctm_plugin.splats.gaussians import MAX_ALPHA, MIN_ALPHA, Camera, Gaussians, ProjectedGaussians, project, secants
 
-TILE = 16
-"""Pixels a side."""
-PLANE = 3
-"""Channels that a picture with depth has more, see :func:`with_plane`."""
-INVERSE = 1
-"""Channels of a picture with ``near / z`` after its colours, z the depth along the camera's axis."""
+TILE_SIDE = 16
+"""Pixels along a tile's side."""
+PLANE_CHANNELS = 3
+"""Number of channels that :func:`with_plane` adds to the colours, for depth."""
+INVERSE_CHANNELS = 1
+"""Number of channels for ``near / z`` after the colours, z the depth along the camera's axis."""
 STRIDES = (1, 4)
-"""Pixels between the three places in a row whose depths :func:`bends` compares."""
-EDGE = 0.03
-"""Difference of two colours, of all that the scene's colours fill, at which a fold weighs 1 / e."""
-SEEN = 0.1
-"""Share of the light that is stopped below which a pixel's depth is not divided by it."""
+"""Pixels from one of the three pixels whose depths :func:`bends` compares to the next."""
+EDGE_WIDTH = 0.03
+"""Difference of two colours, as a share of the scene's range, at which a bend weighs 1 / e."""
+MIN_OPACITY = 0.1
+"""Least opacity of a pixel that its depth is divided by."""
 
 
-def with_plane(projected: Projected, camera: Camera) -> Tensor:
+def with_plane(projected: ProjectedGaussians, camera: Camera) -> Tensor:
     """Colours ``[N, k + 3]`` whose rendering holds expected depth as a plane ``d + x s_x + y s_y`` of each pixel.
 
     x and y are counted from the picture's middle.
@@ -50,22 +45,20 @@ def picture(
 
     Args:
         gaussians: N of them, of k channels.
-        camera: who looks.
+        camera: pose and lens.
         shift: ``[N, 2]`` zeros, whose gradient is that of the means on the picture, in pixels.
         degrees, floor: see :func:`~ctm_plugin.splats.gaussians.colors_seen`.
-        more: 0, :data:`PLANE` (which has no gradients) or :data:`INVERSE`, channels after the colours.
+        more: channels after the colours: 0, :data:`PLANE_CHANNELS` (without gradients) or :data:`INVERSE_CHANNELS`.
 
     Returns:
-        ``[k + more, H, W]``, and ``[H, W]``, the light that nothing has stopped.
+        ``[k + more, H, W]``, and ``[H, W]``, the transmittance.
     """
     projected = project(gaussians, camera, shift, degrees, floor)
     colors = projected.colors
-    if more == PLANE:
+    if more == PLANE_CHANNELS:
         colors = with_plane(projected, camera)
-    elif more == INVERSE:
+    elif more == INVERSE_CHANNELS:
         colors = torch.cat([colors, (camera.near / projected.depths)[:, None]], 1)
-    if colors.is_cuda and (fast := _gsplat()) is not None:
-        return _by_gsplat(fast, projected, colors, camera)
     tables = projected.means, projected.conics, projected.opacities, projected.extents, projected.depths
     return rasterize(*tables, colors, camera.width, camera.height)
 
@@ -79,10 +72,10 @@ def rasterize(
     order = depths.detach().argsort(stable=True)
     means, conics, opacities, extents = (each[order] for each in (means, conics, opacities, extents))
     colors, bands = colors[order], []
-    for top in range(0, height, TILE):
-        bottom, row = min(top + TILE, height), []
-        for left in range(0, width, TILE):
-            right = min(left + TILE, width)
+    for top in range(0, height, TILE_SIDE):
+        bottom, row = min(top + TILE_SIDE, height), []
+        for left in range(0, width, TILE_SIDE):
+            right = min(left + TILE_SIDE, width)
             low, high = means.new_tensor([left, top]), means.new_tensor([right, bottom])
             meets = (extents > 0).all(1) & (means + extents > low).all(1) & (means - extents < high).all(1)
             here = meets.nonzero().squeeze(1)
@@ -93,43 +86,13 @@ def rasterize(
             )
             dx, dy = xs[..., None] - means[here, 0], ys[..., None] - means[here, 1]
             a, b, c = conics[here].unbind(1)
-            alpha = (opacities[here] * (-0.5 * (a * dx * dx + c * dy * dy) - b * dx * dy).exp()).clamp_max(MOST)
-            alpha = alpha * (alpha >= LEAST)
+            alpha = (opacities[here] * (-0.5 * (a * dx * dx + c * dy * dy) - b * dx * dy).exp()).clamp_max(MAX_ALPHA)
+            alpha = alpha * (alpha >= MIN_ALPHA)
             passed = torch.cat([alpha.new_ones(*alpha.shape[:2], 1), 1 - alpha], -1).cumprod(-1)
             row.append(torch.cat([(alpha * passed[..., :-1]) @ colors[here], passed[..., -1:]], -1))
         bands.append(torch.cat(row, 1))
     whole = torch.cat(bands).permute(2, 0, 1)
     return whole[:-1], whole[-1]
-
-
-@functools.cache
-def _gsplat():
-    """The library whose rasteriser GPUs run rather than our kernels; ``None`` where it is not installed."""
-    with suppress(ImportError):
-        import gsplat
-
-        return gsplat
-    if importlib.util.find_spec("triton") is None:
-        warnings.warn(
-            "splats are rasterised by plain torch on this GPU, tens of times slower than by gsplat: "
-            "pip install -e '.[splat]'",
-            stacklevel=3,
-        )
-    return None
-
-
-def _by_gsplat(fast, projected: Projected, colors: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
-    """The same by gsplat's tiles, whose largest alpha is 0.999; lens, projection and colours are ours."""
-    wide, high = -(-camera.width // TILE), -(-camera.height // TILE)
-    radii = projected.extents.ceil().int()[None].contiguous()
-    means, depths = projected.means[None].contiguous(), projected.depths[None].contiguous()
-    _, ids, flat = fast.isect_tiles(means.detach(), radii, depths.detach(), TILE, wide, high)
-    offsets = fast.isect_offset_encode(ids, 1, wide, high)
-    image, opacity = fast.rasterize_to_pixels(
-        means, projected.conics[None].contiguous(), colors[None].contiguous(), projected.opacities[None].contiguous(),
-        camera.width, camera.height, TILE, offsets, flat,
-    )  # fmt: skip
-    return image[0].permute(2, 0, 1), 1 - opacity[0, ..., 0]
 
 
 def expected_depth(
@@ -156,7 +119,7 @@ def bends(
         stopped: the share of the light that made it.
         colors: of the picture, without gradient; what the scene fills is [0, 1].
     """
-    surface, terms = inverse / stopped.detach().clamp_min(SEEN), []
+    surface, terms = inverse / stopped.detach().clamp_min(MIN_OPACITY), []
     for axis in (0, 1):
         for stride in STRIDES:
             count = surface.shape[axis] - 2 * stride
@@ -164,6 +127,6 @@ def bends(
                 before, here, after = (surface.narrow(axis, i * stride, count) for i in range(3))
                 first, middle, last = (colors.narrow(axis, i * stride, count) for i in range(3))
                 edge = torch.maximum((middle - first).abs().mean(-1), (last - middle).abs().mean(-1))
-                fold = (before - 2 * here + after).abs() * (-edge / EDGE).exp()
+                fold = (before - 2 * here + after).abs() * (-edge / EDGE_WIDTH).exp()
                 terms.append(fold.mean() * (surface.shape[1] / stride / len(STRIDES)))
     return sum(terms, inverse.new_zeros(()))

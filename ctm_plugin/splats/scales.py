@@ -13,15 +13,16 @@ from ctm_plugin.scene.shrink import shrink, shrink_mask
 from ctm_plugin.scene.views import Views, unit
 
 SIDES = (4, 2)
-"""Pixels a side of the squares, one stage after the other; then come the pictures as they are."""
-SMALLEST = 80
-"""Pixels of the shorter side that an averaged picture has at least."""
-LOOKED_AT = 16
-"""Views whose detail is measured, at most."""
+"""Pixels along the averaging squares of the stages before full size."""
+MIN_SIDE = 80
+"""Least shorter side in pixels of an averaged picture."""
+MAX_VIEWS = 16
+"""Most views whose detail is measured."""
 OCTAVES = 5
-"""That are looked at: what is coarser is in all pictures."""
-LONGER = 0.6
-"""Power of the share of detail: steps of few pixels cost little (tried on bike and chair)."""
+"""Octaves whose detail is measured: coarser ones are in all pictures."""
+STAGE_POWER = 0.6
+"""Exponent of a stage's share of detail in its share of steps: steps of few pixels cost little (tried on bike and
+chair)."""
 
 
 class Stage(NamedTuple):
@@ -43,9 +44,9 @@ def stages(views: Views) -> list[Stage]:
     squares of s to those of 2 s pixels, has ``rms / s`` of it. So smooth scenes stay coarse for long, leaves do not.
     Weighing frequencies so is DashGaussian's idea (Chen et al., CVPR 2025).
     """
-    sides = [side for side in SIDES if min(views.height, views.width) // side >= SMALLEST and _counts(views, side)]
+    sides = [side for side in SIDES if min(views.height, views.width) // side >= MIN_SIDE and _counts(views, side)]
     powers = torch.zeros(OCTAVES, dtype=torch.float64)
-    for index in range(0, len(views) if sides else 0, -(-len(views) // LOOKED_AT)):
+    for index in range(0, len(views) if sides else 0, -(-len(views) // MAX_VIEWS)):
         picture = unit(views.images[index]).cpu()[..., :3].permute(2, 0, 1)[None]
         for octave in range(OCTAVES):
             coarse = F.avg_pool2d(picture, 2)
@@ -54,7 +55,7 @@ def stages(views: Views) -> list[Stage]:
             picture = coarse
     details = powers.sqrt() / 2.0 ** torch.arange(OCTAVES)
     held = details.flip(0).cumsum(0).flip(0) / details.sum().clamp_min(1e-12)
-    return [Stage(side, float(held[side.bit_length() - 1]) ** LONGER) for side in sides]
+    return [Stage(side, float(held[side.bit_length() - 1]) ** STAGE_POWER) for side in sides]
 
 
 def _counts(views: Views, side: int) -> bool:

@@ -8,9 +8,9 @@ import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
 
-from ctm_plugin.splats.gaussians import BLUR, Camera, Gaussians
+from ctm_plugin.splats.gaussians import EPS2D, Camera, Gaussians
 from ctm_plugin.splats.render import picture
-from ctm_plugin.splats.start import HARMONIC
+from ctm_plugin.splats.start import SH_C0
 
 
 def pixels_made(gaussians: Gaussians, cameras: Sequence[Camera]) -> Float[Tensor, " n"]:
@@ -19,12 +19,12 @@ def pixels_made(gaussians: Gaussians, cameras: Sequence[Camera]) -> Float[Tensor
 
     Pictures are linear in colours, so that is the gradient of the sum of a grey one.
     """
-    grey = gaussians.base.new_zeros(len(gaussians.base), 1, requires_grad=True)
-    bare = Gaussians(*(table.detach() for table in gaussians))._replace(base=grey, rest=grey.new_zeros(len(grey), 0))
+    grey = gaussians.sh0.new_zeros(len(gaussians.sh0), 1, requires_grad=True)
+    bare = Gaussians(*(table.detach() for table in gaussians))._replace(sh0=grey, shN=grey.new_zeros(len(grey), 0))
     shift = torch.zeros_like(bare.means[:, :2])
     for camera in cameras:
         picture(bare, camera, shift, 1, 0.0, 0)[0].sum().backward()
-    return grey.grad[:, 0] / (HARMONIC * len(cameras))
+    return grey.grad[:, 0] / (SH_C0 * len(cameras))
 
 
 def times_seen(places: Float[Tensor, "n 3"], cameras: Sequence[Camera]) -> Int64[Tensor, " n"]:
@@ -45,4 +45,4 @@ def as_wide_as_pixels(gaussians: Gaussians, cameras: Sequence[Camera]) -> Gaussi
     centres = torch.stack([camera.centre for camera in cameras])
     pixels = torch.stack([1 / camera.lens[:2].mean() for camera in cameras])
     pixel = (torch.cdist(gaussians.means, centres) * pixels).amin(1, keepdim=True)
-    return gaussians._replace(scales=((2 * gaussians.scales).exp() + BLUR * pixel.square()).log() / 2)
+    return gaussians._replace(scales=((2 * gaussians.scales).exp() + EPS2D * pixel.square()).log() / 2)

@@ -14,18 +14,18 @@ from ctm_plugin.scene.frustum import projected, view_counts, visual_hull
 from ctm_plugin.scene.views import Scene, composite
 from ctm_plugin.splats.gaussians import Gaussians
 
-FEW = 300
-"""Fewer points of a reconstruction than this are not enough to begin with."""
-OPACITY = 0.1
-"""Of a Gaussian that begins."""
-TRIES = 8
-"""Random places drawn for each that is wanted: most are seen by too few, or lie outside an object."""
-SEEN = 3
-"""Training views that see a random place, at least."""
+MIN_POINTS = 300
+"""Least number of a reconstruction's points to start from."""
+START_OPACITY = 0.1
+"""Initial opacity of a Gaussian."""
+DRAWS_PER_POINT = 8
+"""Random points drawn for each that is wanted: most are seen by too few cameras, or lie outside an object."""
+MIN_VIEWS = 3
+"""Least number of training views that see a random point."""
 NEIGHBOURS = 3
-"""Nearest others, whose root mean square distance is a Gaussian's first size."""
-HARMONIC = 0.28209479177387814
-"""The constant harmonic."""
+"""Nearest neighbours whose root mean square distance is a Gaussian's initial scale."""
+SH_C0 = 0.28209479177387814
+"""Value of the constant spherical harmonic, 1 / (2 sqrt(pi))."""
 
 
 def first_places(scene: Scene, count: int, seed: int) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:
@@ -38,7 +38,7 @@ def first_places(scene: Scene, count: int, seed: int) -> tuple[Float[Tensor, "n 
     """
     points = scene.points
     given = torch.empty(0, 3) if points is None else points.positions
-    drawn = random_places(scene, count, seed) if len(given) < FEW else torch.empty(0, 3)
+    drawn = random_places(scene, count, seed) if len(given) < MIN_POINTS else torch.empty(0, 3)
     places = torch.cat([given, drawn])
     tracked = torch.zeros(0, 2, dtype=torch.long)
     if points is not None and len(points.point):
@@ -52,19 +52,19 @@ def random_places(scene: Scene, count: int, seed: int) -> Float[Tensor, "n 3"]:
     At most ``count``: of those left, the first.
     """
     views, draws = scene.train, Draws(seed, 0, stream="places")
-    many = TRIES * count
-    pixel = draws.integers(len(views) * views.height * views.width, many)
+    drawn = DRAWS_PER_POINT * count
+    pixel = draws.integers(len(views) * views.height * views.width, drawn)
     rays = pixel_rays(views.c2w, views.intrinsics, views.height, views.width, pixel, views.distortion)
-    part = draws.uniform(many, 1)
+    part = draws.uniform(drawn, 1)
     # Evenly along the rays of a bounded scene, else evenly in their inverse: most lies near the cameras.
     inverse = 1 / (1 / max(scene.near, 1e-3 * scene.far) * (1 - part) + part / scene.far)
     t = scene.near + (scene.far - scene.near) * part if scene.geometry == "bounded" else inverse
     places = rays.origins + t * rays.directions
     seen, _ = view_counts(places, views, 0.0)
-    keep = seen >= min(SEEN, len(views))
+    keep = seen >= min(MIN_VIEWS, len(views))
     if views.has_alpha and scene.geometry == "bounded":
         hull = keep & visual_hull(places, views, 0.0)
-        keep = hull if hull.sum() >= FEW else keep
+        keep = hull if hull.sum() >= MIN_POINTS else keep
     return places[keep][:count] if keep.any() else places[:count]
 
 
@@ -99,8 +99,8 @@ def first_gaussians(places: Float[Tensor, "n 3"], colors: Float[Tensor, "n k"], 
     return Gaussians(
         means=places.clone(),
         scales=size[:, None].repeat(1, 3),
-        turns=torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1),
-        opacities=torch.full((count, 1), OPACITY).logit(),
-        base=(colors - 0.5) / HARMONIC,
-        rest=torch.zeros(count, ((degree + 1) ** 2 - 1) * channels),
+        quats=torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1),
+        opacities=torch.full((count, 1), START_OPACITY).logit(),
+        sh0=(colors - 0.5) / SH_C0,
+        shN=torch.zeros(count, ((degree + 1) ** 2 - 1) * channels),
     )

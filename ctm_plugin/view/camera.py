@@ -16,14 +16,14 @@ from ctm_plugin.scene.camera_paths import focus
 from ctm_plugin.scene.poses import is_field_of_view, looked_at
 from ctm_plugin.scene.views import Scene, Views
 
-OPENGL = np.array([1.0, -1.0, -1.0])
-"""Signs of OpenCV's axes (x right, y down, looking along z), which viser has, in OpenGL's."""
-NARROWEST = 1e-3
-"""The least aspect of a window, and the inverse of the greatest."""
+OPENCV_TO_OPENGL = np.array([1.0, -1.0, -1.0])
+"""Signs that take viser's axes, OpenCV's (x right, y down, z forward), to OpenGL's."""
+MIN_ASPECT = 1e-3
+"""Least aspect of a window, and the inverse of the largest."""
 
 
 @dataclass(frozen=True)
-class Camera:
+class BrowserCamera:
     """A pinhole whose axis goes through the picture's centre, as viser has it.
 
     Attributes:
@@ -41,18 +41,18 @@ class Camera:
     def usable(self) -> bool:
         """Whether these are a camera's numbers: a window without area has aspect 0 or NaN."""
         numbers = all(map(math.isfinite, (*self.wxyz, *self.position))) and any(self.wxyz)
-        return numbers and is_field_of_view(self.fov) and NARROWEST <= self.aspect <= 1 / NARROWEST
+        return numbers and is_field_of_view(self.fov) and MIN_ASPECT <= self.aspect <= 1 / MIN_ASPECT
 
     @classmethod
-    def of(cls, c2w: Float[np.ndarray, "3 4"], fov: float, aspect: float = 1.0) -> Camera:
+    def of(cls, c2w: Float[np.ndarray, "3 4"], fov: float, aspect: float = 1.0) -> BrowserCamera:
         """One of OpenGL axes."""
-        wxyz = np.roll(Rotation.from_matrix(c2w[:, :3] * OPENGL).as_quat(), 1)
+        wxyz = np.roll(Rotation.from_matrix(c2w[:, :3] * OPENCV_TO_OPENGL).as_quat(), 1)
         return cls(tuple(wxyz.tolist()), tuple(c2w[:, 3].tolist()), fov, aspect)
 
     @property
     def c2w(self) -> Float32[Tensor, "3 4"]:
         """Camera to world, OpenGL axes."""
-        turn = Rotation.from_quat(np.roll(self.wxyz, -1)).as_matrix() * OPENGL
+        turn = Rotation.from_quat(np.roll(self.wxyz, -1)).as_matrix() * OPENCV_TO_OPENGL
         return torch.from_numpy(np.column_stack([turn, self.position])).float()
 
     def size(self, longest: int) -> tuple[int, int]:
@@ -74,10 +74,10 @@ class Camera:
         return pixel_rays(views.c2w, views.intrinsics, height, width, torch.arange(height * width))
 
 
-def view_camera(views: Views, index: int) -> Camera:
+def view_camera(views: Views, index: int) -> BrowserCamera:
     """A view's camera; of one whose axis misses the picture's centre, or whose lens distorts, the nearest there is."""
     fov = 2 * math.atan(views.height / (2 * views.intrinsics[index, 1].item()))
-    return Camera.of(views.c2w[index].double().cpu().numpy(), fov, views.width / views.height)
+    return BrowserCamera.of(views.c2w[index].double().cpu().numpy(), fov, views.width / views.height)
 
 
 def ahead(scene: Scene, c2w: Float[Tensor, "n 3 4"], times: float = 1.0) -> Float64[np.ndarray, "n 3"]:

@@ -13,26 +13,29 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ctm_plugin.color.light import Light
-from ctm_plugin.color.settings import CONTRASTS, MOST_STOPS, SATURATIONS
+from ctm_plugin.color.settings import CONTRASTS, MAX_STOPS, SATURATIONS
 from ctm_plugin.data.readers.images import to_8_bits
-from ctm_plugin.runs.load import KINDS
+from ctm_plugin.runs.load import VIEW_KINDS
 from ctm_plugin.scene.camera_paths import mean_up
 from ctm_plugin.scene.views import Scene
 from ctm_plugin.show.pictures import depth_picture
-from ctm_plugin.view.camera import Camera, ahead, extent
-from ctm_plugin.view.painter import LAYOUTS, Limit, Look, Shot
+from ctm_plugin.view.camera import BrowserCamera, ahead, extent
+from ctm_plugin.view.painter import LAYOUTS, Limit, Look, Viewpoint
 from ctm_plugin.view.path import PathPanel, called, camera_of
-from ctm_plugin.view.sources import Photograph, Subject
+from ctm_plugin.view.sources import PhotographSource, Subject
 
-LABELS = dict(zip(("lit", "dark", "latent", "depth"), KINDS, strict=True))
+LABELS = dict(zip(("lit", "dark", "latent", "depth"), VIEW_KINDS, strict=True))
 NOTHING, PHOTOGRAPH = "nothing", "photograph"
-COLOURS = {"test": (255, 150, 40), "train": (150, 170, 190)}
-PART = 0.1
-"""Of the root mean square distance between cameras and their centre: a drawn camera's size."""
+CAMERA_COLOURS = {"test": (255, 150, 40), "train": (150, 170, 190)}
+"""Colours of drawn cameras by split."""
+FRUSTUM_SIZE = 0.1
+"""Size of a drawn camera, as a share of the root mean square distance between cameras and their centre."""
 CROP_STEPS = 200
-SIZES = (64, 4096)
-"""Least and most pixels along a finest picture's longer side."""
-MOST_SECONDS = 600.0
+"""Steps of a slider along the scene's box."""
+SIDES = (64, 4096)
+"""Least and largest longer side in pixels of the finest picture."""
+MAX_SECONDS = 600.0
+"""Largest number of seconds that a picture may take."""
 
 
 class Page:
@@ -53,7 +56,7 @@ class Page:
         self,
         client: viser.ClientHandle,
         subjects: dict[str, Subject],
-        views: Sequence[Photograph],
+        views: Sequence[PhotographSource],
         light: Light,
         ask: Callable[[Look, Limit], None],
     ):
@@ -81,7 +84,7 @@ class Page:
         label = f"depth, from {scene.near:.4g} to {scene.far:.4g}"
         self.legend = gui.add_image(legend(scene), label=label, format="png", visible=False)
         stops, hint = round(math.log2(light.gain), 2), "of lit pictures: 1 doubles it"
-        self.stops = gui.add_slider("light, stops", -MOST_STOPS, MOST_STOPS, 0.02, stops, hint=hint)
+        self.stops = gui.add_slider("light, stops", -MAX_STOPS, MAX_STOPS, 0.02, stops, hint=hint)
         hint = "of lit pictures; 1: as photographed"
         self.contrast = gui.add_slider("contrast", *CONTRASTS, 0.01, light.contrast, hint=hint)
         self.saturation = gui.add_slider("saturation", *SATURATIONS, 0.01, light.saturation, hint=hint)
@@ -114,10 +117,10 @@ class Page:
             camera, split = view.camera, "test" if view.views is self._views[0].views else "train"
             mark = self._client.scene.add_camera_frustum(
                 f"/marks/cameras/{number}", camera.fov, camera.aspect, scale=mark_size(self._views), thickness=1.5,
-                thickness_units="screen", color=COLOURS[split], wxyz=camera.wxyz, position=camera.position,
+                thickness_units="screen", color=CAMERA_COLOURS[split], wxyz=camera.wxyz, position=camera.position,
             )  # fmt: skip
 
-            def go(view: Photograph = view) -> None:
+            def go(view: PhotographSource = view) -> None:
                 if self.view.value == view.label:  # else its control does
                     self._place(view)
                 self.view.value = view.label
@@ -127,10 +130,10 @@ class Page:
         self._frame.visible = self.cameras.value
 
     def _quality_controls(self, client: viser.ClientHandle) -> list[viser.GuiInputHandle]:
-        size = min(max(client.camera.image_width, client.camera.image_height, SIZES[0]), SIZES[1])
+        size = min(max(client.camera.image_width, client.camera.image_height, SIDES[0]), SIDES[1])
         with client.gui.add_folder("quality", expand_by_default=False):
-            self.size = client.gui.add_number("longer side", size, min=SIZES[0], max=SIZES[1], step=1, hint="pixels")
-            self.seconds = client.gui.add_number("seconds", Limit().seconds, min=0.1, max=MOST_SECONDS, step=0.1)
+            self.size = client.gui.add_number("longer side", size, min=SIDES[0], max=SIDES[1], step=1, hint="pixels")
+            self.seconds = client.gui.add_number("seconds", Limit().seconds, min=0.1, max=MAX_SECONDS, step=0.1)
         return [self.size, self.seconds]
 
     def _space_controls(self, client: viser.ClientHandle) -> list[viser.GuiInputHandle]:
@@ -155,7 +158,7 @@ class Page:
         if beside != NOTHING:
             sources.append(self.here if beside == PHOTOGRAPH else self._subjects[beside])
         crop = tuple(zip(*(sorted(side.value) for side in self.sides), strict=True)) if self.cropped.value else None
-        shot = Shot(camera, tuple(self.background.value), crop)
+        shot = Viewpoint(camera, tuple(self.background.value), crop)
         kind = LABELS[self.kind.value]
         light = Light(2.0**self.stops.value, self.contrast.value, self.saturation.value)
         return Look(shot, tuple(sources), self.layout.value, self.split.value, kind, light)
@@ -164,7 +167,7 @@ class Page:
     def limit(self) -> Limit:
         """What the controls say; a number that is just being typed may be beyond its range."""
         size, seconds = int(self.size.value), float(self.seconds.value)
-        return Limit(min(max(size, SIZES[0]), SIZES[1]), min(max(seconds, 0.1), MOST_SECONDS))
+        return Limit(min(max(size, SIDES[0]), SIDES[1]), min(max(seconds, 0.1), MAX_SECONDS))
 
     def ask(self) -> None:
         """Have it painted, and show the controls and marks that mean something now."""
@@ -187,7 +190,7 @@ class Page:
         subject, *beside = look.sources
         height, width = self._levels.shape[:2]
         status = f"step {subject.run.step}, {width}x{height} in {seconds:.2f} s"
-        if beside and isinstance(beside[0], Photograph) and not beside[0].seen_from(look.shot.camera):
+        if beside and isinstance(beside[0], PhotographSource) and not beside[0].seen_from(look.shot.camera):
             status += f"; {beside[0].label} as taken"
         self.status.value = status
         self.trouble.value = "; ".join(s.trouble for s in look.sources if isinstance(s, Subject) and s.trouble)
@@ -199,12 +202,12 @@ class Page:
             name = f"{self._scene.name}_{LABELS[self.kind.value]}.png"
             self._client.send_file_download(name, content, save_immediately=True)
 
-    def _place(self, view: Photograph) -> None:
+    def _place(self, view: PhotographSource) -> None:
         """Put the camera where a view's is, upright as the scene is."""
         self.here = view
         self._aim(view.camera, mean_up(self._scene.train))
 
-    def _aim(self, camera: Camera, up: Float[np.ndarray, " 3"] | None = None) -> None:
+    def _aim(self, camera: BrowserCamera, up: Float[np.ndarray, " 3"] | None = None) -> None:
         """Put the camera somewhere, turned as it is or so that this is up."""
         at = self._client.camera
         with self._client.atomic():
@@ -218,7 +221,7 @@ def legend(scene: Scene) -> np.ndarray:
     return to_8_bits(depth_picture(depths, scene.near, scene.far)).numpy()
 
 
-def mark_size(views: Sequence[Photograph]) -> float:
+def mark_size(views: Sequence[PhotographSource]) -> float:
     """How large cameras are drawn, in scene units."""
     eyes = np.array([view.camera.position for view in views])
-    return PART * (float(np.sqrt(((eyes - eyes.mean(0)) ** 2).sum(1).mean())) or 1.0)
+    return FRUSTUM_SIZE * (float(np.sqrt(((eyes - eyes.mean(0)) ** 2).sum(1).mean())) or 1.0)

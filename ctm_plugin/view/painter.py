@@ -16,17 +16,17 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ctm_plugin.color.light import AS_IS, Light
-from ctm_plugin.view.camera import Camera
+from ctm_plugin.view.camera import BrowserCamera
 
 LAYOUTS = ("slider", "side by side")
 Rendered = dict[str, Tensor]
-COARSEST = 16
-"""The least longer side of a picture in pixels; each is twice the one before, but for the last."""
-AT_ONCE = 0.15
-"""Seconds that the first picture after a movement may be expected to take."""
-WORTH = 1.25
-"""Times the last picture's side, below which a finer one is not painted, unless it is the finest."""
-GUESS = 10_000.0
+MIN_SIDE = 16
+"""Longer side in pixels of the coarsest picture; each next one is twice as large, but for the last."""
+FIRST_SECONDS = 0.15
+"""Seconds that the first picture after a movement should take."""
+MIN_GROWTH = 1.25
+"""Least ratio of a finer picture's side to the last one's, unless it is the finest."""
+ASSUMED_SPEED = 10_000.0
 """Pixels a second, as long as none are measured."""
 
 
@@ -34,11 +34,11 @@ class Stopped(Exception):
     """Nobody wants this picture any more."""
 
 
-class Shot(NamedTuple):
-    """What is rendered: a camera, what is behind the scene in levels of sRGB, and two corners of a box of the world,
-    outside which nothing shows; ``None``: all does."""
+class Viewpoint(NamedTuple):
+    """A camera, the background in levels of sRGB, and two corners of a box of the world that the picture is cropped to
+    (``None``: no crop)."""
 
-    camera: Camera
+    camera: BrowserCamera
     background: tuple[int, int, int] = (0, 0, 0)
     crop: tuple[tuple[float, ...], tuple[float, ...]] | None = None
 
@@ -48,12 +48,12 @@ class Look(NamedTuple):
 
     Attributes:
         sources: ``render(shot, height, width, check)`` gives whatever ``picture(rendered, kind, light)`` makes a
-            picture of, one of :data:`ctm_plugin.runs.load.KINDS`; ``check``, called now and then, may raise.
+            picture of, one of :data:`ctm_plugin.runs.load.VIEW_KINDS`; ``check``, called now and then, may raise.
         layout: of two, one of :data:`LAYOUTS`.
         split: how much of the width the left one has under the slider, from 0 to 1.
     """
 
-    shot: Shot
+    shot: Viewpoint
     sources: tuple[Any, ...]
     layout: str = LAYOUTS[0]
     split: float = 0.5
@@ -94,7 +94,7 @@ class Renderings:
             picture[:, at] = 1  # a white line between
         return picture, sum(seconds)
 
-    def _timed(self, source: Any, shot: Shot, height: int, width: int) -> tuple[Rendered, float]:
+    def _timed(self, source: Any, shot: Viewpoint, height: int, width: int) -> tuple[Rendered, float]:
         start = time.perf_counter()
         return source.render(shot, height, width, self._check), time.perf_counter() - start
 
@@ -146,7 +146,7 @@ class Painter:
     ):
         self._paint, self._show = paint, show
         self._tasks: dict[int, Task] = {}
-        self._speed, self._changed, self.closed = GUESS, threading.Condition(), False
+        self._speed, self._changed, self.closed = ASSUMED_SPEED, threading.Condition(), False
 
     def ask(self, client: int, look: Any, limit: Limit = Limit()) -> None:  # noqa: B008 (immutable)
         """From now on a client looks at this. Nothing is painted anew for who looks at what it looked at before."""
@@ -156,8 +156,8 @@ class Painter:
                 return
             size = shown = before.shown if before is not None and before.look.alike(look) else 0
             if not shown:
-                size = COARSEST
-                while 2 * size <= limit.finest and (2 * size) ** 2 / self._speed <= AT_ONCE:
+                size = MIN_SIDE
+                while 2 * size <= limit.finest and (2 * size) ** 2 / self._speed <= FIRST_SECONDS:
                     size *= 2
             self._tasks[client] = Task(look, limit, min(size, limit.finest), shown)
             self._changed.notify()
@@ -208,6 +208,6 @@ class Painter:
             self._speed = task.size**2 / max(seconds, 1e-6)  # pictures have other shapes, but the same before and after
             finest = task.limit.finest
             finer = min(2 * task.size, finest, math.isqrt(int(self._speed * task.limit.seconds)))
-            task.done = finer <= task.size or finer < min(WORTH * task.size, finest)
+            task.done = finer <= task.size or finer < min(MIN_GROWTH * task.size, finest)
             task.shown, task.first = task.size, False
             task.size = task.size if task.done else finer

@@ -10,11 +10,12 @@ import numpy as np
 import viser
 
 from ctm_plugin.scene.camera_paths import KeyFrames
-from ctm_plugin.view.camera import Camera
+from ctm_plugin.view.camera import BrowserCamera
 
-RATE = 10
-"""Pictures a second of a path that is tried."""
-DRAWN = {"color": (80, 220, 120), "thickness": 2.0, "thickness_units": "screen"}
+PREVIEW_FPS = 10
+"""Pictures a second of a previewed path."""
+PATH_STYLE = {"color": (80, 220, 120), "thickness": 2.0, "thickness_units": "screen"}
+"""Colour and width of the path's line."""
 
 
 def called(do: Callable[[], Awaitable[None] | None]) -> Callable[[object], Awaitable[None]]:
@@ -27,10 +28,10 @@ def called(do: Callable[[], Awaitable[None] | None]) -> Callable[[object], Await
     return callback
 
 
-def camera_of(client: viser.ClientHandle) -> Camera | None:
+def camera_of(client: viser.ClientHandle) -> BrowserCamera | None:
     """A client's camera, ``None`` while it has none."""
     at = client.camera
-    camera = Camera(tuple(at.wxyz), tuple(at.position), at.fov, at.aspect)
+    camera = BrowserCamera(tuple(at.wxyz), tuple(at.position), at.fov, at.aspect)
     return camera if camera.usable() else None
 
 
@@ -46,11 +47,11 @@ class PathPanel:
     """
 
     def __init__(
-        self, client: viser.ClientHandle, name: str, size: float, aim: Callable[[Camera], None],
+        self, client: viser.ClientHandle, name: str, size: float, aim: Callable[[BrowserCamera], None],
         lit: Sequence[viser.GuiSliderHandle[float]],
     ):  # fmt: skip
         self._client, self._name, self._size, self._aim, self._lit = client, name, size, aim, lit
-        self._keys: list[Camera] = []
+        self._keys: list[BrowserCamera] = []
         self._marks: list[viser.SceneNodeHandle] = []
         self._playing = False
         gui = client.gui
@@ -72,7 +73,7 @@ class PathPanel:
         lit = tuple(float(control.value) for control in self._lit)
         return KeyFrames(poses, np.array([camera.fov for camera in self._keys]), bool(self._closed.value), lit)
 
-    def set(self, keys: list[Camera]) -> None:
+    def set(self, keys: list[BrowserCamera]) -> None:
         """Take and draw key frames."""
         self._keys, self._count.value, add = keys, str(len(keys)), self._client.scene
         for mark in self._marks:
@@ -80,13 +81,13 @@ class PathPanel:
         self._marks = [
             add.add_camera_frustum(
                 f"/marks/path/{number}", key.fov, key.aspect, scale=self._size, wxyz=key.wxyz, position=key.position,
-                **DRAWN,
+                **PATH_STYLE,
             )
             for number, key in enumerate(keys)
         ]  # fmt: skip
         if len(keys) > 1:
             eyes, closed = np.array([key.position for key in keys]), bool(self._closed.value)
-            line = add.add_spline_catmull_rom("/marks/path/line", eyes, "catmullrom", closed=closed, **DRAWN)
+            line = add.add_spline_catmull_rom("/marks/path/line", eyes, "catmullrom", closed=closed, **PATH_STYLE)
             self._marks.append(line)
 
     def _add(self) -> None:
@@ -102,10 +103,10 @@ class PathPanel:
         was, self._playing = self._playing, play and bool(self._keys)
         if was or not self._playing:
             return
-        c2w, fov = self.key_frames().path(max(2, round(RATE * self._seconds.value)))
+        c2w, fov = self.key_frames().path(max(2, round(PREVIEW_FPS * self._seconds.value)))
         for pose, angle in zip(c2w.double().numpy(), fov.tolist(), strict=True):
             if not self._playing:
                 return
-            self._aim(Camera.of(pose, angle))
-            await asyncio.sleep(1 / RATE)
+            self._aim(BrowserCamera.of(pose, angle))
+            await asyncio.sleep(1 / PREVIEW_FPS)
         self._playing = False

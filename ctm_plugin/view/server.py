@@ -22,20 +22,20 @@ from ctm_plugin.color.light import chosen_light
 from ctm_plugin.cpu.products import fast_products
 from ctm_plugin.errors import ConfigError, CTMError
 from ctm_plugin.view.page import Page
-from ctm_plugin.view.painter import COARSEST, Look, Painter, Renderings, Shot
+from ctm_plugin.view.painter import MIN_SIDE, Look, Painter, Renderings, Viewpoint
 from ctm_plugin.view.settings import ViewConfig
 from ctm_plugin.view.sources import Subject, photographs
 
-EVERY = 2.0
-"""Seconds between looks for a new checkpoint, at most."""
-LOCAL = ("127.0.0.1", "localhost", "::1")
+POLL_S = 2.0
+"""Most seconds from one check for a new checkpoint to the next."""
+LOCAL_HOSTS = ("127.0.0.1", "localhost", "::1")
 """Hosts that no other machine reaches."""
-POLICY = (
+CONTENT_POLICY = (
     "default-src 'self' data: blob:; "
     "script-src 'self' 'unsafe-inline' 'unsafe-eval' 'wasm-unsafe-eval' blob:; "
     "style-src 'self' 'unsafe-inline'"
 )
-"""The browser is to load nothing from other hosts than the page's."""
+"""Content-Security-Policy: the browser loads nothing from other hosts than the page's."""
 COOKIE = "ctm_view"
 
 
@@ -67,7 +67,7 @@ class Viewer:
         self.renderings = Renderings()
         self.painter = Painter(self.renderings.paint, self._show)
         self._pages: dict[int, Page] = {}
-        token = None if host in LOCAL else secrets.token_urlsafe(16)
+        token = None if host in LOCAL_HOSTS else secrets.token_urlsafe(16)
         self.address = page_address(host, port, token)
         with guarded(token), redirect_stdout(io.StringIO()):  # viser tells the address without the token
             self.server = viser.ViserServer(host=host, port=port, label=self.first.scene.name, verbose=False)
@@ -81,12 +81,12 @@ class Viewer:
         """Serve until :meth:`close`, painting in this thread."""
         with fast_products(self.first.run.module.device):
             for subject in self.subjects.values():  # compiles loops and loads a GPU's code: no picture's time
-                subject.render(Shot(self.views[0].camera), COARSEST, COARSEST, lambda: None)
+                subject.render(Viewpoint(self.views[0].camera), MIN_SIDE, MIN_SIDE, lambda: None)
             while not self.painter.closed:
                 if self._pages and any(subject.refresh() for subject in self.subjects.values()):
                     self.renderings.clear()
                     self.painter.repaint()
-                self.painter.step(EVERY)
+                self.painter.step(POLL_S)
 
     def close(self) -> None:
         """End :meth:`work`, and the server."""
@@ -160,7 +160,7 @@ def admitted(path: str, headers: Mapping[str, str], token: str | None) -> bool:
     if origin is not None and urlsplit(origin).netloc != host:
         return False
     if token is None:
-        return urlsplit(f"//{host}").hostname in LOCAL
+        return urlsplit(f"//{host}").hostname in LOCAL_HOSTS
     cookie = SimpleCookie(headers.get("Cookie", "")).get(COOKIE)
     given = [*parse_qs(urlsplit(path).query).get("token", []), cookie.value if cookie else ""]
     return any(compare_digest(each.encode(), token.encode()) for each in given)
@@ -168,7 +168,7 @@ def admitted(path: str, headers: Mapping[str, str], token: str | None) -> bool:
 
 @contextmanager
 def guarded(token: str | None) -> Iterator[None]:
-    """A server that viser starts inside answers what is :func:`admitted`, and sends ``POLICY`` with its pages.
+    """A server that viser starts inside answers what is :func:`admitted`, and sends ``CONTENT_POLICY`` with its pages.
 
     By itself it lets pages of other sites connect, also where the site's name was made to mean this machine (DNS
     rebinding), asks nobody who comes from another machine, and its page loads a script for statistics from elsewhere.
@@ -185,7 +185,7 @@ def guarded(token: str | None) -> Iterator[None]:
                 return connection.respond(403, "this page wants the whole address that `ctm view` printed\n")
             response = process_request(connection, request)
             if response is not None:
-                response.headers["Content-Security-Policy"] = POLICY
+                response.headers["Content-Security-Policy"] = CONTENT_POLICY
                 if token is not None:
                     response.headers["Set-Cookie"] = f"{COOKIE}={token}; Path=/; HttpOnly; SameSite=Strict"
                     response.headers["Referrer-Policy"] = "no-referrer"

@@ -17,18 +17,19 @@ from ctm_plugin.backbones.pictures import PictureBackbone
 from ctm_plugin.color.light import Light
 from ctm_plugin.errors import CTMError
 from ctm_plugin.rays.cameras import Rays, distort
-from ctm_plugin.rays.ndc import STEEPEST
+from ctm_plugin.rays.ndc import MIN_FORWARD
 from ctm_plugin.rays.sampling import intersect_box
 from ctm_plugin.runs.load import load_posed
 from ctm_plugin.runs.rundir import LAST
 from ctm_plugin.scene.views import Scene, Views, composite
-from ctm_plugin.view.camera import Camera, view_camera
-from ctm_plugin.view.painter import Rendered, Shot
+from ctm_plugin.view.camera import BrowserCamera, view_camera
+from ctm_plugin.view.painter import Rendered, Viewpoint
 
-CHUNK = 2048
-"""Rays between two looks at whether to go on."""
-NEAR = 1e-3
-"""Distance from where it was taken, in parts of the camera's from the origin or of 1, within which it is seen."""
+RAY_CHUNK = 2048
+"""Rays rendered between two checks for a newer request."""
+PHOTOGRAPH_DISTANCE = 1e-3
+"""Distance from a photograph's camera, relative to that camera's distance from the origin or to 1, within which the
+photograph is shown."""
 
 
 class Subject:
@@ -77,12 +78,12 @@ class Subject:
         return stat.st_ino, stat.st_mtime_ns, stat.st_size
 
     @torch.no_grad()
-    def render(self, shot: Shot, height: int, width: int, check: Callable[[], None]) -> Rendered:
-        """What :meth:`ctm_plugin.runs.load.Run.picture` needs, on the CPU, ``[H, W, ...]``.
+    def render(self, shot: Viewpoint, height: int, width: int, check: Callable[[], None]) -> Rendered:
+        """What :meth:`ctm_plugin.runs.load.LoadedRun.picture` needs, on the CPU, ``[H, W, ...]``.
 
         Of a crop box: rays begin where they enter it, and those that end behind it, by their expected depth, show the
         background; so do rays that miss it. In normalised device coordinates all rays begin at the near plane, and in
-        whole pictures at the camera. ``check`` is called every ``CHUNK`` rays; whole pictures are too fast for it.
+        whole pictures at the camera. ``check`` is called every ``RAY_CHUNK`` rays; whole pictures are too fast for it.
         """
         module, scene = self.run.module, self.scene
         color = torch.tensor([shot.background], device=module.device) / 255
@@ -98,11 +99,11 @@ class Subject:
         if not whole:
             latent, depth = behind.repeat(count, 1), torch.full_like(enter, scene.far)
             forward = scene.geometry == "forward"
-            hit = (leave > enter) & (rays.directions[:, 2] < -STEEPEST) if forward else leave > enter
+            hit = (leave > enter) & (rays.directions[:, 2] < -MIN_FORWARD) if forward else leave > enter
             index = hit.nonzero().flatten()
-            for start in range(0, len(index), CHUNK):
+            for start in range(0, len(index), RAY_CHUNK):
                 check()
-                part = index[start : start + CHUNK]
+                part = index[start : start + RAY_CHUNK]
                 skipped = (enter[part] - scene.near).clamp_min(0) * (not forward)
                 origins, directions = rays[part]
                 rendered = module.render_rays(Rays(origins + skipped[:, None] * directions, directions), color)
@@ -117,7 +118,7 @@ class Subject:
 
 
 @dataclass(frozen=True, eq=False)
-class Photograph:
+class PhotographSource:
     """One of a scene's views, turned as the camera is where it was taken; elsewhere it stays as taken.
 
     Attributes:
@@ -132,15 +133,15 @@ class Photograph:
     background: Tensor
 
     @property
-    def camera(self) -> Camera:
+    def camera(self) -> BrowserCamera:
         return view_camera(self.views, self.index)
 
-    def seen_from(self, camera: Camera) -> bool:
+    def seen_from(self, camera: BrowserCamera) -> bool:
         """Whether a camera stands where it was taken."""
         eye = np.array(self.camera.position)
-        return bool(np.linalg.norm(eye - camera.position) <= NEAR * max(1.0, float(np.linalg.norm(eye))))
+        return bool(np.linalg.norm(eye - camera.position) <= PHOTOGRAPH_DISTANCE * max(1.0, float(np.linalg.norm(eye))))
 
-    def render(self, shot: Shot, height: int, width: int, check: Callable[[], None]) -> Rendered:
+    def render(self, shot: Viewpoint, height: int, width: int, check: Callable[[], None]) -> Rendered:
         """Looked up where the camera's rays meet the photograph, through its lens; black outside it, ``[H, W, 3]``."""
         camera, views, index = shot.camera, self.views, self.index
         if not self.seen_from(camera):
@@ -152,19 +153,19 @@ class Photograph:
         fx, fy, cx, cy = views.intrinsics[index].tolist()
         at = torch.stack([2 * (fx * u + cx) / views.width - 1, 2 * (fy * v + cy) / views.height - 1], dim=1)
         picture = composite(views.images[index].cpu(), self.background).permute(2, 0, 1)[None]
-        found = F.grid_sample(picture, at.view(1, height, width, 2), padding_mode="border", align_corners=False)
+        sampled = F.grid_sample(picture, at.view(1, height, width, 2), padding_mode="border", align_corners=False)
         inside = (ahead & (at.abs() <= 1).all(1)).view(height, width, 1)
-        return {"rgb": found[0].permute(1, 2, 0) * inside}
+        return {"rgb": sampled[0].permute(1, 2, 0) * inside}
 
     def picture(self, rendered: Rendered, kind: str, light: Light) -> Float[Tensor, "h w 3"]:
         """Lit, unless the run's is as rendered: a photograph has no latent and no depth."""
         return rendered["rgb"] if kind == "rgb" else light.apply(rendered["rgb"])
 
 
-def photographs(scene: Scene, background: Float[Tensor, "1 3"]) -> list[Photograph]:
+def photographs(scene: Scene, background: Float[Tensor, "1 3"]) -> list[PhotographSource]:
     """The test views, then the training views, each by name."""
     return [
-        Photograph(f"{label}{name}", views, index, background)
+        PhotographSource(f"{label}{name}", views, index, background)
         for label, views in (("", scene.test), ("train: ", scene.train))
         for index, name in enumerate(views.names)
     ]

@@ -37,15 +37,15 @@ from pathlib import Path
 from typing import Any, NamedTuple, NoReturn
 
 import yaml
+from scores import SETTING_COLUMNS as OF_SCORES
 
-from ctm_plugin.report import evidence
 from ctm_plugin.report.text import pipes, spread
 
 HERE = Path(__file__).resolve().parent
 ROOT = HERE.parents[1]
 BETWEEN = re.compile(r"^(<!-- table: ([a-z0-9_]+) -->)$(.*?)^(<!-- end -->)$", re.MULTILINE | re.DOTALL)
 MARK = re.compile(r"^<!-- (table: [a-z0-9_]+|end) -->$", re.MULTILINE)
-SETTINGS = (*evidence.SETTINGS, "method")
+SETTINGS = (*OF_SCORES, "method")
 NOT_CONVERGED = "N.C."
 OF_A_COLUMN = ("data", "show", "digits")
 """Keys of a row or column that filter nothing."""

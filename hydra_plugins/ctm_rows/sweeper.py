@@ -129,7 +129,7 @@ def outcomes(
 
     Runs are found by their configuration, as when a sweep goes on: their folders may have other numbers.
     """
-    from ctm_plugin.runs.compose import resolved
+    from ctm_plugin.runs.compose import without_hydras
     from ctm_plugin.runs.sweep import finished, same_run
 
     common = set.intersection(*(set(job) for job in jobs)) if len(jobs) > 1 else set()
@@ -138,7 +138,7 @@ def outcomes(
     for job, done in zip(jobs, returns, strict=True):
         scores = None
         if done.status == JobStatus.COMPLETED:
-            config = resolved(done.cfg, list(done.overrides), told=False)
+            config = without_hydras(done.cfg)  # with what the job decided
             scores = next((metrics for saved, metrics in runs if same_run(saved, config)), {"psnr": done.return_value})
         # A row that does not name a group has the choice of the configuration: it would have no name.
         chosen = (done.hydra_cfg or {}).get("hydra", {}).get("runtime", {}).get("choices", {})

@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor, nn
 
-from ctm_plugin.appearance.exposure import Place
+from ctm_plugin.appearance.exposure import PixelPlaces
 from ctm_plugin.color.srgb import linear_to_srgb
 from ctm_plugin.scene.views import Views
 
@@ -17,16 +17,16 @@ def views(images: Tensor, **given) -> Views:
     return Views(images, torch.eye(4)[:3].repeat(count, 1, 1), torch.ones(count, 4), names, **given)
 
 
-def place(count: int, rendered: Tensor | None = None, seed: int = 0) -> Place:
+def place(count: int, rendered: Tensor | None = None, seed: int = 0) -> PixelPlaces:
     """All pixels of so many pictures, or random ones with what is ``rendered`` there, ``[R, 3]``."""
     if rendered is None:
         steps = (torch.arange(SIDE) + 0.5) / SIDE
         y, x = torch.meshgrid(steps, steps, indexing="ij")
         at = torch.stack([x, y], -1).flatten(0, 1).repeat(count, 1)
-        return Place(torch.arange(count).repeat_interleave(SIDE**2), at, torch.zeros(len(at), 3))
+        return PixelPlaces(torch.arange(count).repeat_interleave(SIDE**2), at, torch.zeros(len(at), 3))
     draw = torch.Generator().manual_seed(seed)
     rows = len(rendered)
-    return Place(torch.randint(0, count, (rows,), generator=draw), torch.rand(rows, 2, generator=draw), rendered)
+    return PixelPlaces(torch.randint(0, count, (rows,), generator=draw), torch.rand(rows, 2, generator=draw), rendered)
 
 
 class Photographs:

@@ -19,7 +19,6 @@ SMALL = ("ctm=off", "backbone.coarse=false")
 
 def stepped(parts):
     """What a training step of the whole gives, and its loss's gradients."""
-    parts.attach.attach(parts.backbone)
     out = parts.backbone.training_step(None, 0)
     out["loss"].backward()
     return out
@@ -82,11 +81,11 @@ def test_where_pixels_lie(compose):
 
 
 def test_its_own_optimizer(compose):
-    parts = assemble(compose(*SMALL, "appearance=affine", "appearance.lr=0.02", "appearance.lr_decay=0.25"))
+    parts = assemble(compose(*SMALL, "appearance=exposure", "appearance.lr=0.02", "appearance.lr_decay=0.25"))
     optimizers = parts.backbone.configure_optimizers()
     optimizers.set_rates(parts.backbone.total_steps)
     groups = {group["name"]: group["lr"] for group in optimizers.members["appearance"].param_groups}
-    assert groups == pytest.approx({"appearance/exposure": 0.005, "appearance/balance": 0.0005})
+    assert groups == pytest.approx({"appearance/exposure": 0.005})
     for given in (["appearance=none"], ["appearance=exposure", "appearance.fixed=true"]):
         without = assemble(compose(*SMALL, *given)).backbone
         assert without.configure_optimizers().members.keys() == {"grids", "mlp"}

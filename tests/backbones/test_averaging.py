@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import nn
 
-from ctm_plugin.backbones.averaging import EVERY, REACH, Averaging, follow, share
+from ctm_plugin.backbones.averaging import STEPS_BETWEEN, WINDOWS, Averaging, follow, share
 
 
 class Walking(Averaging, nn.Module):
@@ -34,7 +34,7 @@ def walk(module: Walking, generator: torch.Generator) -> list[torch.Tensor]:
 def test_the_mean_is_of_the_latest_looks(averaged, total, settled):
     module = Walking(averaged, total, settled)
     before = walk(module, torch.Generator().manual_seed(averaged))
-    looks = before[max(settled, total - REACH * averaged, 0) :: EVERY]
+    looks = before[max(settled, total - WINDOWS * averaged, 0) :: STEPS_BETWEEN]
     expected = looks[0]
     for count, look in enumerate(looks[1:], 1):
         part = max(min(1, 4 / averaged), 9 / (10 + count))
@@ -46,7 +46,9 @@ def test_the_mean_is_of_the_latest_looks(averaged, total, settled):
 def test_buffers_are_those_of_the_last_look():
     module = Walking(8, 102)
     walk(module, torch.Generator())
-    last = max(step for step in range(102) if step >= 102 - REACH * 8 and (step - (102 - REACH * 8)) % EVERY == 0)
+    last = max(
+        step for step in range(102) if step >= 102 - WINDOWS * 8 and (step - (102 - WINDOWS * 8)) % STEPS_BETWEEN == 0
+    )
     assert module.mean_field.running_mean.tolist() == [float(last)] * 3
 
 

@@ -11,7 +11,7 @@ import torch
 from ctm_plugin import cli
 from ctm_plugin.backbones.barf2d import BARF2D
 from ctm_plugin.backbones.settings import BARF2DConfig
-from ctm_plugin.data.planar import TOWARDS, PlanarConfig, cut
+from ctm_plugin.data.planar import PATCH_DIRECTIONS, PlanarConfig, cut
 from ctm_plugin.draws import Draws
 from ctm_plugin.errors import ConfigError, Interrupted
 from ctm_plugin.metrics.rendered import Alignment
@@ -53,7 +53,7 @@ def overrides(painting) -> tuple[str, ...]:
 
 def test_translations_are_found(painting):
     loaded = PlanarConfig(image=painting, noise_h=0, noise_t=0.2, **(SIZE | {"patch": 16})).load()
-    torch.testing.assert_close(loaded.true_warps[:, :2], 0.2 * TOWARDS)
+    torch.testing.assert_close(loaded.true_warps[:, :2], 0.2 * PATCH_DIRECTIONS)
     # By whole pixels, so that patches hold the picture's own colours and an exact solution exists.
     assert torch.equal(loaded.clean, cut(loaded.image, loaded.true_warps, 16))
     config = BARF2DConfig(steps=1500, width=48, depth=2, frequencies=3, lr=5e-3, lr_warp=1e-2)

@@ -93,7 +93,7 @@ def test_geometry_of_another_scene(make, name):
 @pytest.mark.parametrize(("name", "geometry"), [each for each in EVERY if each[1] != "bounded" and each[0] != "dvgo"])
 def test_other_geometries_train(compose, tmp_path, monkeypatch, wall, name, geometry):
     scene = dataclasses.replace(wall, geometry=geometry)
-    monkeypatch.setattr("ctm_plugin.runs.assemble.load_scene", lambda config: scene)
+    monkeypatch.setattr("ctm_plugin.runs.assemble.load_scene", lambda *_: scene)
     result = train(compose(f"backbone={name}", f"backbone.geometry={geometry}"), tmp_path)
     assert math.isfinite(result["psnr"])
 

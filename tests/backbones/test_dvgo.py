@@ -228,7 +228,7 @@ def test_planes_keep_their_number_when_the_grid_grows(llff):
     shapes = []
     for grown in range(3):
         module.grown = grown
-        shapes.append(module.grown_shape(module.field.grid.box))
+        shapes.append(module.grown_shape(module.field.grid.aabb))
     assert [shape[2] for shape in shapes] == [16] * 3
     assert shapes[0][0] * shapes[0][1] < shapes[1][0] * shapes[1][1] < shapes[2][0] * shapes[2][1]
-    torch.testing.assert_close(module.field.grid.box[:, 2], torch.tensor([-1.0, 1.0]))
+    torch.testing.assert_close(module.field.grid.aabb[:, 2], torch.tensor([-1.0, 1.0]))

@@ -71,7 +71,7 @@ def with_density(part: float, field: NeRFField, points: Tensor, directions: Tens
 @pytest.mark.parametrize("path", [NeRFField.__call__, every_sample], ids=["cpu", "gpu"])
 @pytest.mark.parametrize("sizes", [{}, {"depth": 2, "skip": 1}, {"width": 7, "depth": 5, "skip": 4}], ids=str)
 def test_reference(monkeypatch, part, noisy, path, sizes):
-    monkeypatch.setattr(nerf_sparse, "BLOCK", 30)  # the last block is not full
+    monkeypatch.setattr(nerf_sparse, "SAMPLE_BLOCK", 30)  # the last block is not full
     field = make_field(5, **sizes)
     points, directions, noise = make_samples()
     with_density(part, field, points, directions)

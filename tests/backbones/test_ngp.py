@@ -60,7 +60,7 @@ def test_evaluation(each):
     torch.nn.init.uniform_(field.hash_grid.table, -1, 1)
     _, ray, points = field.samples(field.space.local(rays := some_rays(module)), 0.5)
     density, shade = field.evaluate(points)
-    unit = (points - field.space.box[0]) / field.space.box.diff(dim=0).max()
+    unit = (points - field.space.aabb[0]) / field.space.aabb.diff(dim=0).max()
     out = field.hash_grid(unit).double()
     for layer in (first := field.density.layers)[0], first[2]:
         out = (out if layer is first[0] else out.relu()) @ layer.weight.double().T + layer.bias.double()

@@ -45,7 +45,7 @@ class Painted(OccupiedField):
     """Of a density and of :func:`color`."""
 
     def __init__(self, space: Box, density=lumps, threshold: float = 1e-6, samples: int = SAMPLES):
-        super().__init__(space, VoxelGrid(space.box, cubic_shape(space.box, 8**3)), threshold)
+        super().__init__(space, VoxelGrid(space.aabb, cubic_shape(space.aabb, 8**3)), threshold)
         space.divide(space.longest / samples)
         self.density = density
 
@@ -60,7 +60,7 @@ def painted(scene: Scene, **settings) -> Painted:
 def by_hand(scene: Scene, space: Box, rays: Rays, ray: int, offset: float) -> list[tuple[float, Tensor, float]]:
     """Distances in the world, points of the space and lengths in its measure of all samples of a ray."""
     origin, direction = rays.origins[ray].double(), rays.directions[ray].double()
-    low, high = space.box.double()
+    low, high = space.aabb.double()
     found = []
     if scene.geometry == "unbounded":
         centre, radius = space.centre.double(), space.radius
@@ -129,7 +129,7 @@ def test_samples_are_those_whose_nearest_vertex_is_occupied(scene):
     local = field.space.local(rays)
     every = field.samples(local, offset)
     points = every[2]
-    low, high = field.space.box
+    low, high = field.space.aabb
     assert ((points >= low - 1e-4) & (points <= high + 1e-4)).all()
     cells = torch.rand(len(field.occupancy)) < 0.5
     kept = cells[field.grid.nearest(points)]
@@ -173,7 +173,7 @@ def test_query_is_density_a_unit_of_length(scene):
 def test_a_query_outside_or_in_free_space_finds_nothing(scene):
     field, points = painted(scene), torch.randn(50, 3) - torch.tensor([0.0, 0.0, 6.0])
     density = field.query(points, torch.tensor([[0.0, 0.0, -1.0]]).expand(50, 3))[0]
-    low, high = field.space.box
+    low, high = field.space.aabb
     local = field.space.place(points)[0]
     assert torch.equal(density > 0, ((local >= low) & (local <= high)).all(1))
     field.occupancy[:] = False

@@ -11,7 +11,7 @@ import torch.nn.functional as F
 from faults import checkpoint, differences
 from torch import Tensor, nn
 
-from ctm_plugin.backbones.pictures import Picture, PictureBackbone
+from ctm_plugin.backbones.pictures import PictureBackbone, RenderedView
 from ctm_plugin.draws import Draws
 from ctm_plugin.errors import Interrupted
 from ctm_plugin.runs.assemble import Parts, assemble
@@ -40,10 +40,10 @@ class Sheet(PictureBackbone):
 
     Config = SheetConfig
 
-    def __init__(self, config, scene, channels=3, photometric=None, seed=0):
-        super().__init__(scene, config.views, channels, photometric, seed)
+    def __init__(self, config, scene, transform=None, photometric=None, seed=0):
+        super().__init__(scene, config.views, transform, photometric, seed)
         self.total_steps = config.steps
-        self.sheet = nn.Parameter(torch.zeros(1, channels, 4, 4))
+        self.sheet = nn.Parameter(torch.zeros(1, self.channels, 4, 4))
 
     def field_optimizers(self):
         return {"sheet": torch.optim.Adam([self.sheet], 0.05)}
@@ -54,7 +54,7 @@ class Sheet(PictureBackbone):
         whole = F.interpolate(self.sheet.sigmoid() + shift, size, mode="bilinear")[0].permute(1, 2, 0)
         latent = (0.5 * whole + 0.5 * background)[::every, ::every]
         half = torch.full_like(latent[..., 0], 0.5)
-        return Picture(latent, half, None if draws else half * (1 + self.scene.far))
+        return RenderedView(latent, half, None if draws else half * (1 + self.scene.far))
 
 
 @pytest.fixture
@@ -68,9 +68,7 @@ def sheet(ball, monkeypatch) -> Callable[..., dict[str, Any]]:
 @pytest.fixture
 def parts(sheet) -> Callable[..., Parts]:
     def made(*more: str) -> Parts:
-        parts = assemble(sheet("ctm=off", *more))
-        parts.backbone.transform = parts.attach.transform
-        return parts
+        return assemble(sheet("ctm=off", *more))
 
     return made
 
@@ -143,7 +141,7 @@ def test_backgrounds_are_one_colour_a_view(sheet, background, ctm):
     """The same behind the picture and under the rendering; of random ones every fourth is that of evaluation."""
     parts = assemble(sheet(f"ctm={ctm}", f"dataset.background={background}", "dataset.exposure=0.2"))
     module, images = parts.backbone, parts.scene.train.images
-    module.transform = transform = parts.attach.transform
+    transform = module.transform
     transform.begin(module.scene_colors(Draws(0, 0), 1000))
     colours = []
     for batch in steps(module, 12):
@@ -199,7 +197,7 @@ def test_masked_pixels_are_in_no_batch(parts):
 
 @pytest.mark.parametrize("more", [("ctm=quick", "ctm.pretrain_steps=20"), ("ctm=off", "color_space=log")])
 def test_it_trains_scores_and_resumes(sheet, tmp_path, ctrl_c, more):
-    config = sheet(*more, "appearance=affine", "backbone.steps=10", "trainer.accumulate_grad_batches=2")
+    config = sheet(*more, "appearance=exposure", "backbone.steps=10", "trainer.accumulate_grad_batches=2")
     scores = train(config, tmp_path / "whole")
     assert {"psnr", "ssim", "lit_psnr"} & scores.keys()
     assert scores["steps"] == 10
@@ -224,7 +222,7 @@ def test_views_are_what_everybody_asks_for(sheet, tmp_path):
     for name, shape in {"rgb": (12, 12, 3), "latent": (12, 12, 3), "depth": (12, 12), "opacity": (12, 12)}.items():
         assert whole[name].shape == shape
         assert torch.equal(whole[name][::3, ::3], part[name])
-    snapshot = module.snapshot()
+    snapshot = module.snapshot(0)
     assert {"test/depth"} < snapshot.pictures.keys()
     assert isinstance(whole["rgb"], Tensor)
     assert (Path(tmp_path) / "depth" / "r_0.png").exists()

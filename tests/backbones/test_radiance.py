@@ -21,7 +21,6 @@ def backgrounds(compose):
     def draw(*arguments: str):
         parts = assemble(compose("dataset.exposure=0.05", *arguments))
         module = parts.backbone
-        module.transform = parts.attach.transform
         return module, *module.backgrounds(Draws(0, 0), 4000)
 
     return draw
@@ -46,7 +45,7 @@ def test_random_without_a_transform_is_the_whole_cube(backgrounds):
 def test_random_lies_around_a_dark_scene_s_black(compose, space, level, black, ends):
     run = compose("ctm=auto", f"ctm.black={black}", f"color_space={space}", "dataset.background=random")
     parts = assemble(run)
-    module, transform = parts.backbone, parts.attach.transform
+    module, transform = parts.backbone, parts.backbone.transform
     module.transform = transform
     (transform.inner if space == "gain" else transform).begin(torch.full((8, 3), level))
     _, latent = module.backgrounds(Draws(0, 0), 4000)
@@ -96,7 +95,6 @@ def test_colours_start_at_the_scene_s_mean(compose, backbone, ctm):
     """With a transform and without: the sigmoid of the last layers' biases is the mean encoded training colour."""
     parts = assemble(compose(f"backbone={backbone}", f"ctm={ctm}", "dataset.exposure=0.05"))
     module = parts.backbone
-    module.transform = parts.attach.transform
     module.on_train_start()
     pixels = module.scene_colors(Draws(0, 0), 1 << 15)
     biases = module.color_biases()
@@ -166,7 +164,6 @@ def masked(compose):
         images = torch.where(mask[..., None], views.images, views.images.new_tensor([255, 0, 0, 255]))
         scene = replace(scene, train=replace(views, images=images, mask=mask))
         module = type(parts.backbone)(parts.backbone.config, scene, seed=0)
-        module.transform = parts.attach.transform
         return module
 
     return make
@@ -212,7 +209,6 @@ def test_deep_pixels_train_as_8_bit_ones(compose, alpha):
     batches = []
     for stored in (images, images.float() / 255):
         module = type(parts.backbone)(config, replace(scene, train=replace(scene.train, images=stored)), seed=0)
-        module.transform = parts.attach.transform
         batches.append(module.draw(Draws(0, 0)))
     torch.testing.assert_close(batches[0].rgb, batches[1].rgb)
 

@@ -14,7 +14,7 @@ from torch import Tensor
 
 import ctm_plugin
 from ctm_plugin.backbones.settings import SplatConfig
-from ctm_plugin.backbones.splat import RESET, Splat
+from ctm_plugin.backbones.splat import RESET_OPACITY, Splat
 from ctm_plugin.color.dssim import dssim
 from ctm_plugin.color.photometric import Photometric
 from ctm_plugin.data.blender import BlenderConfig
@@ -115,7 +115,7 @@ def test_what_masked_pixels_show_changes_nothing(scene, views):
         masked = dataclasses.replace(scene, train=dataclasses.replace(train, images=images, mask=mask))
         module = make(masked, views=views)
         terms = stepped(module)
-        found.append([module.low, module.range, module.light.gain, terms, gradients(module), module.push])
+        found.append([module.low, module.range, module.light.gain, terms, gradients(module), module.grad2d])
     assert found[0][:3] == found[1][:3]
     for one, other in zip(found[0][3:5], found[1][3:5], strict=True):
         assert one.keys() == other.keys()
@@ -131,11 +131,10 @@ def test_the_range_is_that_of_the_encoded_colours(compose):
     for space in ("rgb", "log"):
         parts = assemble(compose(*SPLAT, f"color_space={space}", "ctm=off", "dataset.exposure=0.05"))
         module = parts.backbone
-        parts.attach.attach(module)
         colors = module.some_colors()
-        parts.attach.transform.begin(colors)
+        parts.backbone.transform.begin(colors)
         module.on_train_start()
-        encoded = parts.attach.transform.encode(colors)
+        encoded = parts.backbone.transform.encode(colors)
         v = (encoded - module.low) / module.range
         inside = ((v > -1e-3) & (v < 1.001)).float().mean()
         assert inside > 0.99
@@ -151,7 +150,7 @@ def test_the_range_is_that_of_the_encoded_colours(compose):
 def test_the_first_colours_are_the_pictures(scene):
     """Before any step, as they are rendered."""
     module = make(scene)
-    seen = 0.5 + 0.28209479 * module.gaussians.base
+    seen = 0.5 + 0.28209479 * module.gaussians.sh0
     torch.testing.assert_close(module.low + module.range * seen.detach(), module.first_colors, atol=1e-5, rtol=0)
 
 
@@ -162,19 +161,18 @@ def test_rgb_and_a_gain_pull_alike(compose, relative):
     for space in ("rgb", "gain"):
         dark = ("dataset.exposure=0.02", "dataset.background=black", f"backbone.relative={str(relative).lower()}")
         parts = assemble(compose(*SPLAT, "ctm=off", f"color_space={space}", *dark))
-        module, transform = parts.backbone, parts.attach.transform
-        parts.attach.attach(module)
+        module, transform = parts.backbone, parts.backbone.transform
         transform.begin(module.some_colors())
         module.on_train_start()
         stepped(module)
         modules.append(module)
     one, other = modules
-    seen = one.seen > 0
-    assert torch.equal(seen, other.seen > 0)
-    factor = (other.push / one.push)[seen].median().item()
-    first = (one.gaussians.base - other.gaussians.base).abs().max().item()
+    seen = one.grad2d_count > 0
+    assert torch.equal(seen, other.grad2d_count > 0)
+    factor = (other.grad2d / one.grad2d)[seen].median().item()
+    first = (one.gaussians.sh0 - other.gaussians.sh0).abs().max().item()
     if relative:
-        torch.testing.assert_close(one.push, other.push, atol=1e-6, rtol=1e-3)
+        torch.testing.assert_close(one.grad2d, other.grad2d, atol=1e-6, rtol=1e-3)
         assert first < 1e-4
     else:
         assert factor > 2
@@ -187,7 +185,7 @@ def test_rgb_and_a_gain_pull_alike(compose, relative):
 def test_what_pulls_at_a_gaussian_is_counted(scene):
     """The gradient of its place on the picture, in halves of its sides, over the views that see it."""
     module = make(scene)
-    expected, seen = torch.zeros(len(module.push)), torch.zeros(len(module.push))
+    expected, seen = torch.zeros(len(module.grad2d)), torch.zeros(len(module.grad2d))
     for step in range(3):
         module.batches_seen = step
         module.training_step(None, 0)["loss"].backward()
@@ -197,8 +195,8 @@ def test_what_pulls_at_a_gaussian_is_counted(scene):
         expected, seen = expected + length, seen + (length > 0)
         module.on_after_backward()
         assert not module.shifts
-    torch.testing.assert_close(module.push, expected)
-    assert torch.equal(module.seen, seen)
+    torch.testing.assert_close(module.grad2d, expected)
+    assert torch.equal(module.grad2d_count, seen)
     assert seen.max() == 3
 
 
@@ -209,8 +207,8 @@ def test_the_pull_does_not_hang_on_how_many_views_a_step_has(scene):
     for step in range(2):
         alone.batches_seen = step
         stepped(alone)
-    torch.testing.assert_close(both.push, alone.push, atol=1e-7, rtol=1e-4)
-    assert torch.equal(both.seen, alone.seen)
+    torch.testing.assert_close(both.grad2d, alone.grad2d, atol=1e-7, rtol=1e-4)
+    assert torch.equal(both.grad2d_count, alone.grad2d_count)
 
 
 def test_pictures_that_nothing_follows_leave_nothing_behind(scene):
@@ -226,7 +224,7 @@ def test_pictures_that_nothing_follows_leave_nothing_behind(scene):
 def grown(compose, tmp_path_factory) -> tuple[dict[str, Any], Path]:
     """20 steps of two batches; growth at 5, 10 and 15, all nearly transparent at 10; its whole run."""
     config = compose(
-        *SPLAT, *GROWS, "ctm.pretrain_steps=20", "trainer.accumulate_grad_batches=2", "appearance=affine",
+        *SPLAT, *GROWS, "ctm.pretrain_steps=20", "trainer.accumulate_grad_batches=2", "appearance=exposure",
         "dataset.background=random_matched", "backbone.lr_opacities=0.2", "backbone.first=100",
     )  # fmt: skip
     run = tmp_path_factory.mktemp("grown") / "whole"
@@ -242,10 +240,10 @@ def test_the_run_grows_and_has_its_optimizers(grown):
     assert (saved["global_step"], saved["batches_seen"]) == (20, 40)
     assert sorted(saved["optimizer_states"][0]) == ["appearance", "ctm", "means", "splats"]
     rates = {group["name"]: group["lr"] for group in saved["optimizer_states"][0]["splats"]["param_groups"]}
-    assert rates["splats/rest"] == pytest.approx(rates["splats/base"] / 20)
+    assert rates["splats/shN"] == pytest.approx(rates["splats/sh0"] / 20)
     moments = saved["optimizer_states"][0]["means"]["state"][0]
     assert moments["exp_avg"].shape == (count, 3)
-    assert saved["state_dict"]["seen"].max() > 0
+    assert saved["state_dict"]["grad2d_count"].max() > 0
 
 
 @pytest.mark.parametrize("batch", [4, 13, 19, 33])
@@ -276,7 +274,7 @@ def test_a_reset_makes_all_nearly_transparent(scene):
     assert moments["exp_avg"].any()
     with torch.no_grad():
         module._reset()
-    assert module.gaussians.opacities.sigmoid().max().item() == pytest.approx(RESET)
+    assert module.gaussians.opacities.sigmoid().max().item() == pytest.approx(RESET_OPACITY)
     assert module.gaussians.opacities[3].item() == -9.0
     assert not moments["exp_avg"].any()
     assert not moments["exp_avg_sq"].any()
@@ -311,11 +309,11 @@ def without_numbers(saved: dict[str, Any]) -> None:
 
 
 def shorter(saved: dict[str, Any]) -> None:
-    saved["state_dict"]["tables.turns"] = saved["state_dict"]["tables.turns"][:-1]
+    saved["state_dict"]["tables.quats"] = saved["state_dict"]["tables.quats"][:-1]
 
 
 def without_statistics(saved: dict[str, Any]) -> None:
-    saved["state_dict"]["push"] = saved["state_dict"]["push"][:-1]
+    saved["state_dict"]["grad2d"] = saved["state_dict"]["grad2d"][:-1]
 
 
 def no_number(saved: dict[str, Any]) -> None:
@@ -374,7 +372,7 @@ def test_a_step_in_bf16_is_one_in_float32(scene, monkeypatch, loops):
 def test_what_dashboards_are_told(grown):
     module = load_posed(grown[1]).module
     assert module.stats() == {"gaussians": float(len(module.gaussians.means))}
-    assert {"test/depth"} < module.snapshot().pictures.keys()
+    assert {"test/depth"} < module.snapshot(0).pictures.keys()
     assert 2 < float(module.render_view(module.scene.test, 0)["depth"].min()) < 6
     with pytest.raises(CTMError, match="Splat has no method query"):
         module.query(torch.zeros(1, 3), torch.zeros(1, 3))
@@ -395,7 +393,7 @@ SPACES = ["log", "hsv_cart", "lab"]
         ("ctm=auto",),
         ("ctm=on", "ctm.k=5", "loss=mse"),
         ("ctm=quick", "appearance=exposure", "backbone.bend=0.1", "trainer.accumulate_grad_batches=2"),
-        ("ctm=off", "appearance=bilateral", "dataset.background=white"),
+        ("ctm=off", "appearance=exposure", "dataset.background=white"),
         ("ctm=off", "dataset.background=random", "backbone.degree=3", "backbone.opacity=0.01", "backbone.dssim=0.9"),
         ("ctm=off", "backbone.relative=false", "backbone.dssim=0", "trainer.precision=bf16-mixed"),
     ],
@@ -432,7 +430,7 @@ def test_a_capture_through_lenses(compose, hall, tmp_path, monkeypatch):
         dataclasses.replace(views, distortion=lens.repeat(len(views), 1)) for views in (scene.train, scene.test)
     )
     monkeypatch.setattr(
-        "ctm_plugin.runs.assemble.load_scene", lambda config: dataclasses.replace(scene, train=train_, test=test)
+        "ctm_plugin.runs.assemble.load_scene", lambda *_: dataclasses.replace(scene, train=train_, test=test)
     )
     learns = (f"backbone.{size}" for size in LEARNS)
     config = compose("dataset=llff", f"dataset.root={hall}", *SPLAT, "ctm=off", *learns)
@@ -455,7 +453,7 @@ def test_two_processes_step_as_one(arguments, compose, tmp_path):
     assert len({len(step["state_dict"]["tables.means"]) for step in steps}) > 1
     # At first all are round: the gradient of their turns is nothing but rounding.
     assert max(ddp_rank.apart(compose(*more), [step]) for step in steps[1:]) < ddp_rank.APART
-    assert checkpoint(tmp_path / "two")["state_dict"]["seen"].sum() > 0
+    assert checkpoint(tmp_path / "two")["state_dict"]["grad2d_count"].sum() > 0
 
 
 def test_it_grows_while_the_graph_of_an_earlier_step_lives(scene):
@@ -466,7 +464,7 @@ def test_it_grows_while_the_graph_of_an_earlier_step_lives(scene):
     kept.backward(retain_graph=True)
     optimizers.step()
     moments = optimizers.state[module.tables["means"]]["exp_avg"].clone()
-    rows = torch.arange(len(module.push)) >= 3
+    rows = torch.arange(len(module.grad2d)) >= 3
     with torch.no_grad():
         added = Gaussians(*(table[:7].clone() for table in module.gaussians))
         module._replace(Change(rows, added))
@@ -483,14 +481,14 @@ def test_it_grows_while_the_graph_of_an_earlier_step_lives(scene):
 
 def tiny(patch: pytest.MonkeyPatch) -> None:
     """Let pictures of 12 pixels be averaged."""
-    patch.setattr(scales, "SMALLEST", 3)
+    patch.setattr(scales, "MIN_SIDE", 3)
     patch.setattr(scales, "OCTAVES", 3)
 
 
 @pytest.fixture(scope="module")
 def coarse(compose, tmp_path_factory) -> tuple[dict[str, Any], Path, list[tuple[int, int]]]:
     """A run whose pictures have 3, 6 and 12 pixels a side, with alpha and masks' appearance; each step's width."""
-    config = compose(*SPLAT, *GROWS, "ctm=off", "appearance=bilateral", "backbone.steps=18", "dataset.exposure=0.2")
+    config = compose(*SPLAT, *GROWS, "ctm=off", "appearance=exposure", "backbone.steps=18", "dataset.exposure=0.2")
     widths, render = [], Splat.render
     with pytest.MonkeyPatch.context() as patch:
         tiny(patch)
@@ -541,6 +539,6 @@ def test_small_pictures_pull_as_the_whole_ones_do(scene):
     module.learn_from(scales.averaged(scene.train, 2))
     module.cameras.clear()
     stepped(module)
-    for name in ("means", "scales", "opacities", "base"):  # round ones have no turn
+    for name in ("means", "scales", "opacities", "sh0"):  # round ones have no turn
         found, wanted = module.tables[name].grad.flatten(), expected[name].flatten()
         assert (found - wanted).norm() < 0.4 * wanted.norm(), name

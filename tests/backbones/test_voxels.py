@@ -45,7 +45,7 @@ def make_field(threshold: float = TINY, seed: int = 1, planes: bool = False, dir
     space = NDCSpace(BOX, NDC(1.2, 1.5, 0.9), FAR) if planes else Box(BOX, NEAR, FAR, FAR)
     space.measure = 0.6
     shift = torch.linspace(-2, 1, SHAPE[2]) if planes else math.log(1 / (1 - ALPHA) - 1)
-    field = VoxelField(space, SHAPE, FEATURES, make_color(), direct=direct, threshold=threshold, step=0.5, shift=shift)
+    field = VoxelField(space, SHAPE, FEATURES, make_color(), direct=direct, alpha_thre=threshold, step=0.5, shift=shift)
     with torch.no_grad():
         field.density.copy_(3 * torch.randn(field.density.shape, generator=generator(seed)) + 1)
         field.features.copy_(2 * torch.randn(field.features.shape, generator=generator(seed + 1)))
@@ -101,7 +101,7 @@ def test_fresh_grid(alpha_init):
     for interval in (1.0, 0.25):
         space, shift = Box(BOX, NEAR, FAR, FAR), math.log(1 / (1 - alpha_init) - 1)
         space.measure = 0.5 * space.spacing(SHAPE) / interval
-        field = VoxelField(space, SHAPE, 3, make_color(), threshold=1e-4, step=0.5, shift=shift)
+        field = VoxelField(space, SHAPE, 3, make_color(), alpha_thre=1e-4, step=0.5, shift=shift)
         expected = torch.full(SHAPE, 1 - (1 - alpha_init) ** interval)
         torch.testing.assert_close(field.alpha(), expected, rtol=1e-4, atol=0)
         assert field.occupancy.all()
@@ -111,7 +111,7 @@ def test_fresh_grid(alpha_init):
 def test_a_fresh_grid_gives_all_planes_the_same_weight(planes):
     space = NDCSpace(torch.tensor([[-1.3, -1.2, -1.0], [1.3, 1.2, 1.0]]), NDC(1.2, 1.5, 0.9), FAR)
     space.measure, shift = planes / (planes - 1) / BASE_PLANES, plane_shift(planes)
-    field = VoxelField(space, (6, 5, planes), 3, make_color(), direct=True, threshold=TINY, step=1.0, shift=shift)
+    field = VoxelField(space, (6, 5, planes), 3, make_color(), direct=True, alpha_thre=TINY, step=1.0, shift=shift)
     rays = Rays(torch.zeros(1, 3), torch.tensor([[0.0, 0.0, -1.0]]))
     _, _, samples = field(rays, torch.zeros(1, 3), 0.0)
     # The last plane lies at t = 1, where the ray ends: its weight is what passes.
@@ -123,7 +123,7 @@ def test_a_fresh_grid_gives_all_planes_the_same_weight(planes):
 @pytest.mark.parametrize("plane", [0, 3, 6])
 def test_depth_of_an_opaque_plane_is_a_distance_in_the_world(plane):
     space = NDCSpace(torch.tensor([[-1.3, -1.2, -1.0], [1.3, 1.2, 1.0]]), ndc := NDC(1.2, 1.5, 0.9), FAR)
-    field = VoxelField(space, (6, 5, 8), 3, make_color(), direct=True, threshold=TINY, step=1.0, shift=torch.zeros(8))
+    field = VoxelField(space, (6, 5, 8), 3, make_color(), direct=True, alpha_thre=TINY, step=1.0, shift=torch.zeros(8))
     field.density.data.fill_(-100.0).view(6, 5, 8)[:, :, plane] = 100.0
     directions = F.normalize(torch.tensor([[0.1, -0.2, -1.0], [0.0, 0.3, -1.0]]), dim=1)
     rays = Rays(torch.tensor([[0.1, 0.0, 0.1], [0.0, -0.1, -0.1]]), directions)
@@ -192,7 +192,7 @@ def test_resize_keeps_a_linear_field(shape):
     assert field.grid.shape == shape
     assert field.grid.voxel == pytest.approx((8.75 / math.prod(shape)) ** (1 / 3))
     assert field.space.stride == pytest.approx(0.5 * field.grid.voxel)
-    assert torch.equal(field.grid.box, BOX)
+    assert torch.equal(field.grid.aabb, BOX)
     for table in tables:
         torch.testing.assert_close(table.data, linear(field.grid.vertices(), table.shape[1]), atol=1e-5, rtol=0)
         assert table.grad is None

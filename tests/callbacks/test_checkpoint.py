@@ -14,7 +14,6 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from toy import Toy, small_ctm, trainer
 
-from ctm_plugin.callbacks.attach_ctm import AttachTransform
 from ctm_plugin.callbacks.checkpoint import SIGNALS, CheckpointFile, LastCheckpoint
 from ctm_plugin.errors import CheckpointError, Interrupted
 
@@ -45,9 +44,9 @@ class Signal(L.Callback):
 
 
 def fit(last: LastCheckpoint, *callbacks: L.Callback, steps: int = 7, accumulate: int = 1) -> L.Trainer:
-    fitter = trainer(steps, AttachTransform(small_ctm()), *callbacks, last, accumulate_grad_batches=accumulate)
+    fitter = trainer(steps, *callbacks, last, accumulate_grad_batches=accumulate)
     with last.listening():
-        fitter.fit(Toy(steps))
+        fitter.fit(Toy(steps, small_ctm()))
     return fitter
 
 
@@ -94,9 +93,9 @@ def test_a_signal_ends_the_run_after_the_step_in_progress(tmp_path, number, hook
 
 def test_a_signal_between_two_steps_ends_the_run_after_the_next(tmp_path):
     last = Recorded(tmp_path, 100)
-    fitter = trainer(7, AttachTransform(small_ctm()), last, Signal("on_train_batch_end", 3))  # after it
+    fitter = trainer(7, last, Signal("on_train_batch_end", 3))  # after it
     with last.listening():
-        fitter.fit(Toy(7))
+        fitter.fit(Toy(7, small_ctm()))
     assert last.steps == [4]
 
 

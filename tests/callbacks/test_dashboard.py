@@ -14,7 +14,6 @@ from toy import LR, Clock, Toy, small_ctm, trainer
 
 from ctm_plugin.backbones.base import Backbone
 from ctm_plugin.callbacks import dashboard
-from ctm_plugin.callbacks.attach_ctm import AttachTransform
 from ctm_plugin.callbacks.dashboard import Dashboard
 from ctm_plugin.color.settings import TransformTraining
 from ctm_plugin.metrics.image import psnr
@@ -34,10 +33,10 @@ def curves(tmp_path, monkeypatch, *callbacks: L.Callback, log_every: int = 2, **
     monkeypatch.setattr(
         TensorBoardLogger, "log_metrics", lambda self, metrics, step=None: logged.update({step: metrics})
     )
-    attach = AttachTransform(small_ctm(), TransformTraining(lr=0.02, lr_decay=0.1))
+    ctm = small_ctm(learning=TransformTraining(lr=0.02, lr_decay=0.1))
     logger = TensorBoardLogger(tmp_path)
     settings |= {"logger": logger, "log_every_n_steps": log_every}
-    trainer(6, attach, Dashboard(), *callbacks, **settings).fit(Watched(6))
+    trainer(6, Dashboard(), *callbacks, **settings).fit(Watched(6, ctm))
     return logged
 
 

@@ -3,7 +3,7 @@
 import pytest
 from faults import checkpoint, differences
 
-from ctm_plugin.callbacks.deadline import LONGEST, SHORTEST
+from ctm_plugin.callbacks.deadline import MAX_STRETCH, MIN_STRETCH
 from ctm_plugin.callbacks.preview import PREVIEW
 from ctm_plugin.callbacks.stopwatch import Stopwatch
 from ctm_plugin.errors import ConfigError, Interrupted
@@ -68,7 +68,7 @@ def test_the_whole_schedule_is_followed(compose, tmp_path, speed):
     assert means["lr"] == pytest.approx(0.01 * means["initial_lr"], rel=0.2)
 
 
-@pytest.mark.parametrize(("seconds", "steps"), [(1e-4, LONGEST * 50), (100.0, SHORTEST * 50)])
+@pytest.mark.parametrize(("seconds", "steps"), [(1e-4, MAX_STRETCH * 50), (100.0, MIN_STRETCH * 50)])
 def test_there_is_a_longest_and_a_shortest_training(compose, tmp_path, speed, seconds, steps):
     speed(lambda spent: seconds)
     train(config(compose, "backbone.steps=50"), tmp_path / "run", lambda *_: None)
@@ -96,7 +96,7 @@ def test_an_interrupted_run_goes_on_to_the_bit(compose, tmp_path, speed, ctrl_c,
 def test_with_the_same_turns_it_ends_with_the_same_bits(compose, tmp_path, speed, ctrl_c, monkeypatch):
     """Where no mark comes after the interruption, nothing is decided anew."""
     given = config(compose, "backbone.steps=60", "trainer.checkpoint_every=1000")
-    monkeypatch.setattr("ctm_plugin.callbacks.deadline.MARKS", 2)
+    monkeypatch.setattr("ctm_plugin.callbacks.deadline.CLOCK_CHECKS", 2)
     speed(lambda spent: 2.0)
     train(given, tmp_path / "whole", lambda *_: None)
     ctrl_c(lambda seen: seen == 22)

@@ -8,7 +8,6 @@ import torch
 from lightning.pytorch.plugins import MixedPrecision
 from toy import Toy, copied, same, small_ctm, trainer
 
-from ctm_plugin.callbacks.attach_ctm import AttachTransform
 from ctm_plugin.callbacks.checkpoint import LastCheckpoint
 from ctm_plugin.callbacks.dashboard import Dashboard
 from ctm_plugin.callbacks.finite import FiniteLoss
@@ -33,7 +32,7 @@ class Spoiled(Toy):
 def fit(toy: Toy, tmp_path, *callbacks: L.Callback, every: int = 2, **settings) -> L.Trainer:
     path = tmp_path / "last.ckpt"
     keep = [FiniteLoss(path), *callbacks, LastCheckpoint(tmp_path, path, tmp_path / "previous.ckpt", every)]
-    fitter = trainer(STEPS, AttachTransform(small_ctm()), *keep, **settings)
+    fitter = trainer(STEPS, *keep, **settings)
     fitter.fit(toy)
     return fitter
 
@@ -74,7 +73,7 @@ class Poison(L.Callback):
 
 def test_parameters_that_are_no_numbers_are_not_saved(tmp_path):
     with pytest.raises(DivergedError, match=r"step 4: parameter 'layer\.weight' is nan; training stopped"):
-        fit(Toy(STEPS), tmp_path, Poison())
+        fit(Toy(STEPS, small_ctm()), tmp_path, Poison())
     saved = torch.load(tmp_path / "last.ckpt", weights_only=True)
     assert saved["global_step"] == 2
     assert [path.name for path in tmp_path.iterdir()] == ["last.ckpt"]
@@ -82,7 +81,7 @@ def test_parameters_that_are_no_numbers_are_not_saved(tmp_path):
 
 def test_they_stop_the_next_step_where_none_is_saved(tmp_path):
     with pytest.raises(DivergedError, match="step 4: loss term 'enc' is nan"):
-        fit(Toy(STEPS), tmp_path, Poison(), every=100)
+        fit(Toy(STEPS, small_ctm()), tmp_path, Poison(), every=100)
 
 
 class PoisonAll(L.Callback):
@@ -94,11 +93,11 @@ class PoisonAll(L.Callback):
 
 @pytest.mark.parametrize("k", [3, 5])
 def test_pictures_of_no_numbers_do_not_come_before_it(tmp_path, k):
-    watch = [PoisonAll(), FiniteLoss(tmp_path / "last.ckpt"), Dashboard(1)]
+    watch = [PoisonAll(), FiniteLoss(tmp_path / "last.ckpt"), Dashboard()]
     logger = TensorBoard(TensorBoard.Config(), tmp_path, 0)
-    fitter = trainer(STEPS, AttachTransform(small_ctm(k=k)), *watch, logger=logger, log_every_n_steps=1)
+    fitter = trainer(STEPS, *watch, logger=logger, log_every_n_steps=1, limit_val_batches=1, val_check_interval=1)
     with pytest.raises(DivergedError, match="step 4: loss term 'enc' is nan"):
-        fitter.fit(Toy(STEPS, channels=k))
+        fitter.fit(Toy(STEPS, small_ctm(k=k)))
 
 
 def test_an_overflow_of_scaled_gradients_is_not_mistaken_for_it(tmp_path):
@@ -109,7 +108,7 @@ def test_an_overflow_of_scaled_gradients_is_not_mistaken_for_it(tmp_path):
             seen.append((copied(pl_module), scaler.get_scale()))
 
     scaler = torch.amp.GradScaler("cpu", init_scale=2.0**120)
-    fit(Toy(STEPS), tmp_path, Look(), plugins=[MixedPrecision("16-mixed", "cpu", scaler)])
+    fit(Toy(STEPS, small_ctm()), tmp_path, Look(), plugins=[MixedPrecision("16-mixed", "cpu", scaler)])
     assert [scale for _, scale in seen] == [2.0 ** (119 - step) for step in range(STEPS)]
     assert all(same(weights, seen[0][0]) for weights, _ in seen)
     assert torch.load(tmp_path / "last.ckpt", weights_only=True)["global_step"] == STEPS

@@ -8,7 +8,6 @@ from rich.console import Console
 from toy import Clock, Toy, small_ctm, trainer
 
 from ctm_plugin.callbacks import progress
-from ctm_plugin.callbacks.attach_ctm import AttachTransform
 from ctm_plugin.callbacks.progress import ProgressLine
 from ctm_plugin.settings.registry import COLOR_SPACES
 from ctm_plugin.show.bars import error_console
@@ -22,7 +21,7 @@ def clock(monkeypatch) -> None:
 def fit(console: Console, *callbacks: L.Callback, refresh: float = 3.0, **settings) -> ProgressLine:
     line = ProgressLine()
     line.console, line.refresh = console, refresh
-    trainer(10, AttachTransform(small_ctm()), line, *callbacks, **settings).fit(Toy(10))
+    trainer(10, line, *callbacks, **settings).fit(Toy(10, small_ctm()))
     return line
 
 
@@ -50,7 +49,7 @@ def test_what_was_fitted_is_told_at_the_start():
     line = ProgressLine()
     line.console = Console(file=out, width=200)
     gain = COLOR_SPACES.get("gain")()
-    trainer(2, AttachTransform(gain), line).fit(Toy(2))
+    trainer(2, line).fit(Toy(2, gain))
     first, *_ = out.getvalue().splitlines()
     assert first == f"fitted to the scene's colours: gain {0.9 / float(gain.level):.3g}"
 

@@ -6,7 +6,6 @@ import torch
 from toy import Clock, Toy, small_ctm, trainer
 
 from ctm_plugin.callbacks import stopwatch
-from ctm_plugin.callbacks.attach_ctm import AttachTransform
 from ctm_plugin.callbacks.stopwatch import Stopwatch, peak_memory_mb
 from ctm_plugin.color.settings import TransformTraining
 
@@ -39,8 +38,8 @@ class Work(L.Callback):
 
 
 def fit(watch: Stopwatch, work: Work, resume=None, steps: int = 4) -> None:
-    attach = AttachTransform(small_ctm(), TransformTraining(pretrain_steps=1))
-    trainer(steps, watch, attach, work).fit(Toy(steps), ckpt_path=resume, weights_only=True)
+    toy = Toy(steps, small_ctm(learning=TransformTraining(pretrain_steps=1)))
+    trainer(steps, watch, work).fit(toy, ckpt_path=resume, weights_only=True)
 
 
 def test_counts_training_alone(clock):
@@ -68,8 +67,7 @@ def test_a_finished_training_takes_no_longer(clock, tmp_path):
         def on_fit_start(self, *args):
             clock.now += 7.0
 
-    attach = AttachTransform(small_ctm())
-    trainer(4, again, attach, Slow()).fit(Toy(4), ckpt_path=tmp_path / "x.ckpt", weights_only=True)
+    trainer(4, again, Slow()).fit(Toy(4, small_ctm()), ckpt_path=tmp_path / "x.ckpt", weights_only=True)
     assert again.state_dict() == first.state_dict()
 
 

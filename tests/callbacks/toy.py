@@ -9,7 +9,8 @@ from torch.optim import Adam
 
 from ctm_plugin.backbones.base import Backbone, Batch, Rendering
 from ctm_plugin.color.ctm import CTM
-from ctm_plugin.color.settings import CTMConfig
+from ctm_plugin.color.settings import CTMConfig, TransformTraining
+from ctm_plugin.color.transform import ColorTransform
 from ctm_plugin.draws import seeded
 
 LR = 1e-2
@@ -25,11 +26,11 @@ class Toy(Backbone):
 
     batch_rays = 8
 
-    def __init__(self, steps: int = 6, channels: int = 3, seed: int = 0):
-        super().__init__(channels, seed=seed)
+    def __init__(self, steps: int = 6, transform: ColorTransform | None = None, seed: int = 0):
+        super().__init__(transform, seed=seed)
         self.total_steps = steps
         with seeded(seed):
-            self.layer = nn.Linear(8, channels)
+            self.layer = nn.Linear(8, self.channels)
 
     def draw(self, draws):
         rows = self.batch_rays // draws.world
@@ -59,13 +60,16 @@ class Clock:
         return self.now
 
 
-def small_ctm(seed: int = 1, **config) -> CTM:
+def small_ctm(seed: int = 1, learning: TransformTraining | None = None, **config) -> CTM:
     with seeded(seed):
-        return CTM(CTMConfig(width=8, P=2, **config))
+        ctm = CTM(CTMConfig(width=8, P=2, **config))
+    ctm.learning = learning or ctm.learning
+    return ctm
 
 
 def trainer(steps: int, *callbacks: L.Callback, **settings) -> L.Trainer:
     quiet = dict.fromkeys(("logger", "enable_checkpointing", "enable_progress_bar", "enable_model_summary"), False)
+    quiet |= {"limit_val_batches": 0}
     return L.Trainer(accelerator="cpu", max_steps=steps, callbacks=list(callbacks), **quiet | settings)
 
 

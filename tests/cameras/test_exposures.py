@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from ctm_plugin.cameras.exposures import FEWEST_SEEN, log_gains, medians
+from ctm_plugin.cameras.exposures import MIN_POINTS, log_gains, medians
 
 VIEWS, POINTS = 12, 300
 
@@ -22,8 +22,8 @@ def test_gains_are_found_whatever_shines_and_whoever_sees_it(spread):
 
 
 def test_pictures_that_see_too_little_are_left_out():
-    views = np.repeat([1, 2, 3], [FEWEST_SEEN, FEWEST_SEEN, FEWEST_SEEN - 1])
-    points = np.concatenate([np.arange(FEWEST_SEEN), np.arange(FEWEST_SEEN), np.arange(FEWEST_SEEN - 1)])
+    views = np.repeat([1, 2, 3], [MIN_POINTS, MIN_POINTS, MIN_POINTS - 1])
+    points = np.concatenate([np.arange(MIN_POINTS), np.arange(MIN_POINTS), np.arange(MIN_POINTS - 1)])
     assert len(log_gains(np.zeros(len(views)), views, points)) == 2
     assert len(log_gains(*[np.zeros(0, kind) for kind in (float, int, int)])) == 0
 

@@ -24,7 +24,7 @@ from scipy.spatial.transform import Rotation
 
 from ctm_plugin import cli
 from ctm_plugin.cameras import command
-from ctm_plugin.cameras.colmap import DIAGONAL, choose_pairs, focal_length
+from ctm_plugin.cameras.colmap import FILM_DIAGONAL, choose_pairs, focal_length
 from ctm_plugin.cameras.exposures import UNEVEN
 from ctm_plugin.cameras.photographs import home_of, list_photographs
 from ctm_plugin.cameras.trust import Trusted
@@ -182,7 +182,7 @@ def test_two_lenses_and_upright_pictures_have_a_camera_each(tmp_path):
     walls, focal = painted(), {}
     for number, (name, pose) in enumerate(zip(NAMES, POSES, strict=True)):
         size, film = SIZE[:: -1 if number % 3 == 2 else 1], (41, 27)[number % 2]
-        focal[Path(name).name] = film * np.hypot(*SIZE) / DIAGONAL
+        focal[Path(name).name] = film * np.hypot(*SIZE) / FILM_DIAGONAL
         exif = Image.Exif()
         exif[Base.Orientation] = 1  # Pillow writes none into a PNG that has but the other tag
         exif.get_ifd(IFD.Exif)[Base.FocalLengthIn35mmFilm] = film

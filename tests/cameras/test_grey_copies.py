@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ctm_plugin.cameras.search import as_grey, find_gain, read_light
-from ctm_plugin.color.light import MEAN, brighten
+from ctm_plugin.color.light import TARGET_MEAN, brighten
 from ctm_plugin.data.readers.images import read_picture
 
 
@@ -38,7 +38,7 @@ def test_the_mean_becomes_mid_grey_by_one_factor(level, seed):
     greys = [torch.rand(9, 7, generator=torch.Generator().manual_seed(seed)) * level * part for part in (0.5, 1.0)]
     gain = find_gain(greys)
     bright = [brighten(grey, gain).mean().item() for grey in greys]
-    assert sum(bright) / 2 == pytest.approx(MEAN.at, abs=1e-3)
+    assert sum(bright) / 2 == pytest.approx(TARGET_MEAN.at, abs=1e-3)
     assert bright[0] < bright[1]
 
 

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from ctm_plugin.cameras import search
-from ctm_plugin.cameras.colmap import FEWER, OTHER, USUAL, Features
+from ctm_plugin.cameras.colmap import CLOSER, FEWER_MATCHES, STANDARD, Features
 from ctm_plugin.cameras.search import find_cameras
 from ctm_plugin.cameras.settings import CamerasConfig
 from ctm_plugin.cameras.trust import Trusted
@@ -74,13 +74,13 @@ def searched(tmp_path, monkeypatch):
 
 
 def test_a_sound_model_is_taken_at_once(searched, capsys):
-    assert searched(GOOD) == ("good", [("usual", USUAL)])
+    assert searched(GOOD) == ("good", [("usual", STANDARD)])
     stages = [line.rpartition(", ")[0] for line in capsys.readouterr().err.splitlines()]
     assert stages == ["brightness: 4 of 4", "details: 4 of 4", "pairs: 6 of 6", "placed: 3 of 4", "refined: 2 of 2"]
 
 
 def test_too_few_places_are_searched_from_another_start(searched, capsys):
-    assert searched(FEW, GOOD) == ("good", [("usual", USUAL), ("usual", OTHER)])
+    assert searched(FEW, GOOD) == ("good", [("usual", STANDARD), ("usual", CLOSER)])
     assert (
         "a place for 2 of 4 pictures, of which a mean one sees 0 points that two others see: placed again from another "
         "start, with fewer matches\n"
@@ -94,7 +94,7 @@ def test_places_that_contradict_the_matches_are_searched_again(searched, capsys)
 
 def test_thin_models_are_searched_again_with_pooled_details(searched, capsys):
     """The one that more sights hold is taken."""
-    assert searched(NOISY, GOOD) == ("good", [("usual", USUAL), ("pooled", FEWER)])
+    assert searched(NOISY, GOOD) == ("good", [("usual", STANDARD), ("pooled", FEWER_MATCHES)])
     assert "a mean one sees 80 points that two others see: searched again for details pooled" in capsys.readouterr().err
     assert searched(NOISY, FEW)[0] == "noisy"
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from ctm_plugin.cameras.trust import MOST_ERROR, explained
+from ctm_plugin.cameras.trust import MAX_ERROR, explained
 
 FOCAL = (300.0, 150.0)
 
@@ -36,7 +36,7 @@ def test_pixels_are_those_of_the_picture(pixels, expected, side):
     slopes = [(line**2).sum(1) / focal**2 for line, focal in zip(lines, FOCAL[::-1], strict=True)]
     own = 1 - side  # the line of the picture whose places are moved
     across = lines[own] / np.linalg.norm(lines[own], axis=1, keepdims=True)
-    away = pixels * MOST_ERROR * np.sqrt((slopes[0] + slopes[1]) / slopes[own])
+    away = pixels * MAX_ERROR * np.sqrt((slopes[0] + slopes[1]) / slopes[own])
     rays[side][:, :2] += across * away[:, None] / FOCAL[side]
     fit = explained(*rays, *poses, *FOCAL)
     assert fit.mean() > 0.9 if expected else fit.mean() < 0.1

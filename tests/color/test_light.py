@@ -15,9 +15,9 @@ from kornia.color import linear_rgb_to_rgb, rgb_to_linear_rgb
 
 from ctm_plugin.color.light import (
     KNEE,
-    LEAST,
-    MEAN,
-    MOST_COLOUR,
+    MAX_SATURATION,
+    MIN_GAIN,
+    TARGET_MEAN,
     Light,
     brighten,
     chosen_light,
@@ -105,7 +105,7 @@ LIGHTS = st.builds(Light, st.floats(0.1, 1000.0), st.floats(0.5, 2.0))
 def test_the_mean_of_grey_copies_is_reached(level, seed):
     levels = pictures(level, seed).double().flatten() / 255
     factor = factor_to_mean(levels, torch.ones_like(levels))
-    assert float(brighten(levels, factor).mean()) == pytest.approx(MEAN.at, abs=1e-6)
+    assert float(brighten(levels, factor).mean()) == pytest.approx(TARGET_MEAN.at, abs=1e-6)
 
 
 @given(LIGHTS)
@@ -167,7 +167,7 @@ def test_no_gain_and_no_contrast_nearby_is_better(exposure):
 
 def test_pale_pictures_get_colour_and_vivid_ones_keep_theirs():
     grey, vivid = scene(0.02).mean(-1, keepdim=True).expand(-1, -1, -1, 3), scene(0.02) * torch.tensor([1.0, 0.3, 0.3])
-    assert find_light(0.95 * grey + 0.05 * scene(0.02)).saturation == MOST_COLOUR
+    assert find_light(0.95 * grey + 0.05 * scene(0.02)).saturation == MAX_SATURATION
     assert find_light(vivid).saturation == 1.0
 
 
@@ -203,7 +203,7 @@ def test_what_is_bright_in_a_scene_of_many_stops_belongs_to_it():
 
 def test_light_that_would_be_little_is_none():
     assert find_light(scene(0.8)) == Light()
-    assert find_light(scene(0.3)).gain >= LEAST
+    assert find_light(scene(0.3)).gain >= MIN_GAIN
 
 
 def test_one_bright_pixel_is_not_brightened_beyond_the_largest():

@@ -20,7 +20,7 @@ from ctm_plugin.rays.grid import VoxelGrid
 from ctm_plugin.rays.hash_grid import HashGrid
 
 LATTICE = VoxelGrid(torch.tensor([[-1.0] * 3, [1.0, 1.2, 0.9]]), (6, 7, 8))
-BUFFERS = LATTICE.box[0], LATTICE.scale, LATTICE.last, LATTICE.offsets
+BUFFERS = LATTICE.aabb[0], LATTICE.scale, LATTICE.last, LATTICE.offsets
 HASHED = HashGrid(3, 2, 256, 4, 16)
 RAYS, SAMPLES = 20, 15
 

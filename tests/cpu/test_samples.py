@@ -77,7 +77,7 @@ def test_corners(shape, count, seed):
     rng = torch.Generator().manual_seed(seed)
     grid = field_of(shape, rng).grid
     points = 1.3 * (2 * torch.rand(count, 3, generator=rng) - 1)
-    buffers = grid.box[0], grid.scale, grid.last, grid.offsets
+    buffers = grid.aabb[0], grid.scale, grid.last, grid.offsets
     for found, expected in zip(grid.corners(points), corners.reference(points, *buffers), strict=True):
         assert torch.equal(found, expected)
         assert found.dtype == expected.dtype

@@ -10,7 +10,7 @@ from torch import Tensor
 from ctm_plugin.cpu.splat_projection import GEOMETRY, project
 from ctm_plugin.cpu.splats import BROAD, TALL, binned, draw, packed
 from ctm_plugin.splats.gaussians import Gaussians
-from ctm_plugin.splats.render import INVERSE, PLANE, picture
+from ctm_plugin.splats.render import INVERSE_CHANNELS, PLANE_CHANNELS, picture
 
 
 @pytest.mark.parametrize("name", SETTINGS)
@@ -27,7 +27,7 @@ def test_picture_and_gradients(name):
 def test_inverse_depth_has_gradients(lens):
     of = setting(40, lens=lens)
     counts = certain(of.projected(), of.camera, 2e-3)
-    close(*both_ways(of, counts, INVERSE), counts, 2e-5)
+    close(*both_ways(of, counts, INVERSE_CHANNELS), counts, 2e-5)
 
 
 @pytest.mark.parametrize("name", ["through a lens", "of five channels and all harmonics", "discs"])
@@ -35,17 +35,17 @@ def test_depth(name):
     of = SETTINGS[name]
     counts = certain(of.projected(), of.camera, 2e-3)
     found, expected = (
-        of.rendered(run, dtype, PLANE)[2].detach()
+        of.rendered(run, dtype, PLANE_CHANNELS)[2].detach()
         for run, dtype in ((picture, torch.float32), (picture.reference, DOUBLE))
     )
-    assert found.shape[0] == of.gaussians.base.shape[1] + PLANE
+    assert found.shape[0] == of.gaussians.sh0.shape[1] + PLANE_CHANNELS
     apart = (found.double() - expected).abs() * counts
     bound = expected.abs().amax((1, 2), keepdim=True)
     assert (apart <= (2e-5 if name != "discs" else 1e-3) * bound).all()
 
 
 def test_pictures_with_depth_have_no_gradients():
-    _, _, image, _ = setting(5).rendered(picture, torch.float32, PLANE)
+    _, _, image, _ = setting(5).rendered(picture, torch.float32, PLANE_CHANNELS)
     with pytest.raises(NotImplementedError, match="gradients of pictures with depth"):
         image.sum().backward()
 
@@ -109,7 +109,7 @@ def test_any_number_of_threads(threads):
 
 @pytest.mark.parametrize(
     ("field", "value"),
-    [("means", math.nan), ("means", 1e30), ("scales", math.nan), ("turns", math.nan), ("opacities", math.nan)],
+    [("means", math.nan), ("means", 1e30), ("scales", math.nan), ("quats", math.nan), ("opacities", math.nan)],
 )
 def test_what_is_no_number_is_not_shown(field, value):
     """Nor does it end the process, as a place in no tile would."""

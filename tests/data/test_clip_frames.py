@@ -5,7 +5,7 @@ import pytest
 from clips import pan, wall
 from scipy.ndimage import uniform_filter1d, zoom
 
-from ctm_plugin.data.clip_frames import APART, FEWEST, MOST, STILL, Course, choose, course
+from ctm_plugin.data.clip_frames import FRAME_MOVEMENT, MAX_FRAMES, MIN_FRAMES, MIN_MOVEMENT, Course, choose, course
 
 
 def grey(frames: list[np.ndarray], light: float = 1.0, noise: float = 0.0) -> list[np.ndarray]:
@@ -35,7 +35,7 @@ def test_going_nearer_is_movement():
 @pytest.mark.parametrize("noise", [0.0, 3.0])
 def test_a_tripod_and_a_hand_that_shakes_go_nowhere(noise):
     shaking = pan(100 + np.array([0, 1, 0, -1] * 20))
-    assert course(grey(shaking, 0.1, noise)).moved[-1] < STILL
+    assert course(grey(shaking, 0.1, noise)).moved[-1] < MIN_MOVEMENT
     assert choose([course(grey(shaking, 0.1, noise))]) == [[]]
 
 
@@ -43,8 +43,8 @@ def test_frames_are_apart_by_movement_and_not_by_the_clock():
     """The camera rests for 60 frames, and goes on twice as fast."""
     places = np.concatenate([np.arange(0, 120, 1), np.full(60, 120), np.arange(120, 320, 2)])
     (numbers,) = choose([course(grey(pan(places)))])
-    assert len(numbers) == pytest.approx(320 / 80 / APART, abs=3)
-    assert max(np.diff(places[numbers])) <= 2.2 * 80 * APART
+    assert len(numbers) == pytest.approx(320 / 80 / FRAME_MOVEMENT, abs=3)
+    assert max(np.diff(places[numbers])) <= 2.2 * 80 * FRAME_MOVEMENT
     assert sum(120 < number < 179 for number in numbers) <= 2
 
 
@@ -55,11 +55,11 @@ def test_the_sharpest_is_chosen():
     sharp = np.arange(len(frames)) % 5 == 2
     frames = [frame if keep else uniform_filter1d(frame, 7, axis=1) for frame, keep in zip(frames, sharp, strict=True)]
     (numbers,) = choose([course(frames)])
-    assert len(numbers) >= FEWEST - 2
+    assert len(numbers) >= MIN_FRAMES - 2
     assert sharp[numbers].mean() > 0.95
 
 
-@pytest.mark.parametrize(("length", "count"), [(0.5, FEWEST), (5.0, 80), (50.0, MOST)])
+@pytest.mark.parametrize(("length", "count"), [(0.5, MIN_FRAMES), (5.0, 80), (50.0, MAX_FRAMES)])
 def test_clips_share_the_frames_by_how_far_they_go(length, count):
     def straight(length: float) -> Course:
         return Course(np.linspace(0, length, 500), np.ones(500))

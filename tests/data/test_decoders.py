@@ -118,6 +118,19 @@ def test_planes_apart(tmp_path):
     np.testing.assert_allclose(read_image(tmp_path / "a.tiff"), np.moveaxis(code, 0, -1) / 65535, atol=1e-7)
 
 
+@pytest.mark.parametrize("compression", ["tiff_lzw", "tiff_adobe_deflate", "packbits"])
+def test_compressed(tmp_path, compression):
+    code = RNG.integers(0, 256, (9, 9, 3), dtype=np.uint8)
+    Image.fromarray(code).save(tmp_path / "a.tif", compression=compression)
+    assert np.array_equal(to_8_bits(read_image(tmp_path / "a.tif")), code)
+
+
+def test_white_is_0(tmp_path):
+    """As scanners write bilevel and grey pictures."""
+    tiff(tmp_path / "a.tif", np.array([[0, 255]], np.uint8), photometric="miniswhite")
+    assert to_8_bits(read_image(tmp_path / "a.tif")).tolist() == [[[255] * 3, [0] * 3]]
+
+
 @pytest.mark.parametrize("suffix", ["jpg", "png", "webp", "tif"])
 @pytest.mark.parametrize("orientation", [*range(10)])
 def test_orientation_is_applied_unless_asked(tmp_path, suffix, orientation):
@@ -226,23 +239,19 @@ def truncated(path):
     path.write_bytes(path.read_bytes()[:-40])
 
 
-def lzw(path):
-    Image.fromarray(RNG.integers(0, 256, (9, 9, 3), dtype=np.uint8)).save(path, compression="tiff_lzw")
-
-
 def large_tiff(path):
-    """Width and height, tags 256 and 257, of 2^20 each."""
+    """Width and height, tags 256 and 257, of 9000 each."""
     content = path.read_bytes()
     for tag, kind, count in ((256, 3, 1), (256, 4, 1), (257, 3, 1), (257, 4, 1)):
         at = content.find(struct.pack("<HHI", tag, kind, count))
         if at >= 0:
-            content = content[:at] + struct.pack("<HHII", tag, 4, 1, 2**20) + content[at + 12 :]
+            content = content[:at] + struct.pack("<HHII", tag, 4, 1, 9000) + content[at + 12 :]
     path.write_bytes(content)
 
 
 def large_exr(path):
     old = np.array([0, 0, 11, 7], "<i4").tobytes()
-    path.write_bytes(path.read_bytes().replace(old, np.array([0, 0, 99999, 99999], "<i4").tobytes()))
+    path.write_bytes(path.read_bytes().replace(old, np.array([0, 0, 8999, 8999], "<i4").tobytes()))
 
 
 def window(path):
@@ -263,11 +272,9 @@ NAN = np.full((4, 4, 3), np.nan, np.float32)
         *((suffix, lambda path: path.unlink(), "no such file") for suffix in ("png", "tif", "exr")),
         *((suffix, holds(b""), "an empty file") for suffix in ("png", "tif", "exr")),
         ("png", holds(b"hello"), "something that is not an image, expected a whole image"),
-        ("tif", holds(b"hello"), "a TIFF that cannot be read"),
-        ("exr", holds(b"hello"), "an EXR that cannot be read"),
+        *((suffix, holds(b"hello"), "a picture that cannot be read") for suffix in ("tif", "exr")),
         ("png", truncated, "an image that cannot be read .*: copy it here again, or leave it out"),
-        ("tif", truncated, "a TIFF that cannot be read"),
-        ("exr", truncated, "an EXR that cannot be read"),
+        *((suffix, truncated, "a picture that cannot be read") for suffix in ("tif", "exr")),
         ("png", holds(b"\x89PNG\r\n\x1a\n"), "something that is not an image"),
         ("png", holds(b"%!PS-Adobe-3.0 EPSF"), "something that is not an image"),
         ("png", holds(b"version https://git-lfs.github.com/spec/v1\noid"), "a Git LFS pointer .*: git lfs pull"),
@@ -280,17 +287,14 @@ NAN = np.full((4, 4, 3), np.nan, np.float32)
         ("avif", truncated, "an image that cannot be read .*: copy it here again, or leave it out"),
         ("png", holds(png(8_001, 8_001, 8, 6, b"")), f"an image of 8001x8001 pixels, .*at most {MAX_PIXELS} pixels"),
         ("png", holds(png(100_000, 100_000, 8, 6, b"")), f"an image .*expected .*at most {MAX_PIXELS} pixels"),
-        ("tif", large_tiff, "an image of 1048576x1048576 pixels, expected a whole TIFF"),
-        ("exr", large_exr, "an image of 100000x100000 pixels"),
-        ("tif", lzw, "a TIFF that cannot be read .*imagecodecs"),
+        ("tif", large_tiff, "an image of 9000x9000 pixels, expected a whole TIFF"),
+        ("exr", large_exr, "an image of 9000x9000 pixels"),
         ("tif", lambda path: tiff(path, NAN), "NaN or infinity"),
         ("exr", lambda path: exr(path, {"RGB": NAN}), "NaN or infinity"),
-        ("tif", lambda path: tiff(path, np.zeros((4, 4), np.int16), photometric="minisblack"), "YX of 1 samples, int"),
-        ("tif", lambda path: tiff(path, np.zeros((4, 4), bool), photometric="minisblack"), "YX of 1 samples, bool"),
-        ("tif", lambda path: tiff(path, np.zeros((4, 4), np.uint8), photometric="miniswhite"), ".*photometric 0"),
-        ("tif", lambda path: write(path, np.zeros((4, 4, 4), np.uint8), "unspecified"), ".*more samples"),
-        ("exr", window, r"a data window \[0, 0\] to \[11, 7\], expected all of its display window, \[0, 0\] to \[19,"),
-        ("exr", lambda path: exr(path, {"Z": np.zeros((4, 6), np.float32)}), "channels Z, expected a whole EXR"),
+        ("tif", lambda path: tiff(path, np.zeros((4, 4), np.int16), photometric="minisblack"), "channels Y of int16"),
+        ("tif", lambda path: write(path, np.zeros((4, 4, 4), np.uint8), "unspecified"), "channels R, G, B, channel3"),
+        ("exr", window, "a data window of 0 12 0 8.*, expected all of its display window, 0 20 0 20"),
+        ("exr", lambda path: exr(path, {"Z": np.zeros((4, 6), np.float32)}), "channels Z of float, expected a whole"),
     ],
 )
 @pytest.mark.filterwarnings("ignore::PIL.Image.DecompressionBombWarning")
@@ -308,10 +312,6 @@ def test_the_extra_is_named(tmp_path, monkeypatch):
         patch.setitem(sys.modules, "pillow_heif", None)
         with pytest.raises(CTMError, match=r"reading HEIC needs pillow-heif: pip install -e '\.\[photos\]'"):
             read_picture(tmp_path / "a.heic")
-    write(tmp_path / "a.exr", np.zeros((4, 6, 3), np.float32))
-    monkeypatch.setitem(sys.modules, "OpenEXR", None)
-    with pytest.raises(CTMError, match=r"a\.exr needs OpenEXR: pip install -e '\.\[exr\]'"):
-        read_picture(tmp_path / "a.exr")
 
 
 def test_depth(tmp_path):

@@ -16,7 +16,7 @@ from scipy.optimize import brentq
 
 from ctm_plugin.data.colmap import ColmapConfig
 from ctm_plugin.data.readers.colmap_model import mark_as_shown, searched_in
-from ctm_plugin.data.readers.lens import Camera
+from ctm_plugin.data.readers.lens import Intrinsics
 from ctm_plugin.data.settings import CaptureConfig
 from ctm_plugin.errors import ConfigError, DataError
 from ctm_plugin.settings.build import build
@@ -35,7 +35,7 @@ def fill(folder: Path, size: tuple[int, int], count: int = COUNT) -> None:
         iio.imwrite(folder / name, np.full((size[1], size[0], 3), 99, dtype=np.uint8))
 
 
-CAMERA = Camera(500, 375, 735.4, 735.0, 251.0, 186.0, where="camera 1")
+CAMERA = Intrinsics(500, 375, 735.4, 735.0, 251.0, 186.0, where="camera 1")
 PATH, SOURCE = Path("a.png"), Path("cameras.bin")
 
 

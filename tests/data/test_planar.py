@@ -12,7 +12,7 @@ from skimage.transform import ProjectiveTransform
 from skimage.transform import warp as skimage_warp
 
 from ctm_plugin.color.light import brighten
-from ctm_plugin.data.planar import TOWARDS, PlanarConfig, cut, draw_warps, fitted
+from ctm_plugin.data.planar import PATCH_DIRECTIONS, PlanarConfig, cut, draw_warps, fitted
 from ctm_plugin.data.settings import PHOTOGRAPHS, NoiseConfig
 from ctm_plugin.errors import ConfigError, DataError
 from ctm_plugin.rays.homography import patch_corners, sl3_exp, to_pixels, warp
@@ -71,7 +71,7 @@ def test_all_corners_lie_inside(seed):
 
 def test_four_patches_go_to_the_corners():
     warps = torch.stack([draw_warps(PlanarConfig(seed=seed)) for seed in range(80)])
-    torch.testing.assert_close(warps.mean(0)[:, :2], 0.2 * TOWARDS, atol=0.05, rtol=0)
+    torch.testing.assert_close(warps.mean(0)[:, :2], 0.2 * PATCH_DIRECTIONS, atol=0.05, rtol=0)
     assert 0.07 < warps[:, 1:, 2:].std() < 0.11  # less than noise_h: what does not fit is drawn again
     assert not torch.equal(warps[0], warps[1])
 

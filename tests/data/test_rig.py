@@ -8,7 +8,7 @@ from ctm_scenes.trajectory import hemisphere
 from layouts import llff_layout, room_poses, transforms_layout
 
 from ctm_plugin.data.llff import LLFFConfig
-from ctm_plugin.data.readers.lens import Camera
+from ctm_plugin.data.readers.lens import Intrinsics
 from ctm_plugin.data.rig import Rig, rig_of, turn
 from ctm_plugin.data.transforms import TransformsConfig
 from ctm_plugin.settings.registry import DATASETS
@@ -63,7 +63,7 @@ def test_cameras_far_behind_others_do_not_fit_planes():
 
 
 def test_the_corner_is_the_widest_ray():
-    wide, narrow = Camera(40, 20, 25, 20, 10, 12), Camera(40, 20, 90, 90, 20, 10)
+    wide, narrow = Intrinsics(40, 20, 25, 20, 10, 12), Intrinsics(40, 20, 90, 90, 20, 10)
     rig = rig_of([narrow, wide], [room_poses()[0, :3]], (20, 40), False)
     assert rig.corner == pytest.approx(math.atan(math.hypot(30 / 25, 12 / 20)))
 

@@ -11,11 +11,11 @@ import pytest
 from ctm_scenes.trajectory import hemisphere
 
 from ctm_plugin.data.readers.colmap_model import Taken, read_cameras, read_images, read_points
-from ctm_plugin.data.readers.lens import Camera
+from ctm_plugin.data.readers.lens import Intrinsics
 from ctm_plugin.data.write_colmap import write_model
 
 CAMERAS = [
-    Camera(24.0, 16.0, 30.0, 29.0, 12.5, 7.5, distortion)
+    Intrinsics(24.0, 16.0, 30.0, 29.0, 12.5, 7.5, distortion)
     for distortion in ((0.0,) * 5, (-0.08, 0.01, 0.001, -0.002, 0.0), (-0.08, 0.01, 0.001, -0.002, 0.003))
 ]
 TAKEN = [

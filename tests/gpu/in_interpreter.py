@@ -22,13 +22,13 @@ from ctm_plugin.optim.grid_adam import step_table
 from ctm_plugin.rays import hash_density
 from ctm_plugin.rays.grid import VoxelGrid, corners, scattered, weighted
 from ctm_plugin.rays.hash_grid import HashGrid, encoded, spread
-from ctm_plugin.rays.occupancy import occupied_samples, placed_samples
+from ctm_plugin.rays.occupancy import occupied_samples
 from ctm_plugin.rays.volume import volume_weights
 from ctm_plugin.splats.render import rasterize
 
 CPU = torch.device("cpu")
 GRID = VoxelGrid(torch.tensor([[-1.0] * 3, [1.0, 1.2, 0.9]]), (6, 7, 8))
-BUFFERS = GRID.box[0], GRID.scale, GRID.last, GRID.offsets
+BUFFERS = GRID.aabb[0], GRID.scale, GRID.last, GRID.offsets
 COUNTS = (0, 1, 127, 130, 300)
 """No blocks at all, parts of one, one and a bit, several."""
 KERNELS = {call.kernel: call for call in door.registered.values() if call.kernel}
@@ -163,28 +163,6 @@ def test_samples(rays, contracted, share):
         for one, other in zip(found, plain, strict=True):
             assert one.dtype == other.dtype
             torch.testing.assert_close(one, other, atol=2e-6, rtol=2e-6)
-
-
-@pytest.mark.parametrize("places", [1, 100, 2000])
-def test_samples_with_places(places):
-    """Fewer than there are samples, and more."""
-    origins, directions = torch.rand(3, 23).T - 0.5, normalize(torch.rand(23, 3) - 0.5, dim=1)
-    occupancy = torch.rand(GRID.count) < 0.4
-    arguments = origins, directions, torch.rand(23), torch.arange(23) * 7, 0.021, occupancy, *BUFFERS, False
-    spare = 23 + torch.arange(places) // 64
-    *found, count = samples.placed_samples(*arguments, spare)
-    assert 100 < count < 2000
-    every = samples.occupied_samples(*arguments)
-    there = min(places, len(every[0]))
-    for one, other in zip(found, every, strict=True):
-        assert len(one) == places
-        torch.testing.assert_close(one[:there], other[:there], rtol=0, atol=0)
-    t, ray_index, points = (each[there:] for each in found)
-    assert not t.any()
-    assert not points.any()
-    plain = placed_samples.reference(*arguments, spare)
-    assert torch.equal(ray_index, plain[1][there:])
-    assert [each.dtype for each in plain] == [each.dtype for each in (*found, count)]
 
 
 @pytest.mark.parametrize("features", [1, 2, 3])

@@ -119,7 +119,7 @@ def test_what_a_callback_logs_is_there_once_at_the_steps_of_the_rest(installed, 
     ],
 )
 def test_what_cannot_be_used_is_told_before_data_is_read(arguments, refused, argument, said, tmp_path, monkeypatch):
-    monkeypatch.setattr("ctm_plugin.runs.assemble.load_scene", lambda config: pytest.fail("data is read"))
+    monkeypatch.setattr("ctm_plugin.runs.assemble.load_scene", lambda *_: pytest.fail("data is read"))
     assert said in refused(*arguments, f"hydra.run.dir={tmp_path / 'run'}", argument)
     assert not (tmp_path / "run").exists()
 
@@ -202,7 +202,7 @@ def test_a_strangers_id(tmp_path, content):
 
 @pytest.mark.parametrize("name", ["wandb", "mlflow"])
 def test_a_missing_package_is_told_with_its_extra(compose, tmp_path, name, monkeypatch):
-    monkeypatch.setattr("ctm_plugin.runs.assemble.load_scene", lambda config: pytest.fail("data is read"))
+    monkeypatch.setattr("ctm_plugin.runs.assemble.load_scene", lambda *_: pytest.fail("data is read"))
     monkeypatch.setattr({"wandb": wandb, "mlflow": mlflow}[name], f"_{name.upper()}_AVAILABLE", False)
     with pytest.raises(ConfigError, match=rf"logger: found '{name}', expected .*pip install -e '.\[{name}\]'"):
         train(compose(*SMALL, f"logger={name}"), tmp_path / "run")

@@ -5,6 +5,7 @@ import re
 from pathlib import Path
 
 import pytest
+from callbacks.toy import small_ctm
 from tensorboard.backend.event_processing import plugin_event_multiplexer
 from tensorboard.backend.event_processing.data_provider import MultiplexerDataProvider
 from tensorboard.backend.event_processing.event_multiplexer import EventMultiplexer
@@ -122,7 +123,7 @@ def test_plug_ins_without_our_keys():
     result = {"dataset": "d", "backbone": "tiny", "ctm": "another", "color_space": "rgb", "steps": 3,
               "appearance": "none"}  # fmt: skip
     config["ctm"]["strength"], config["loss"]["weight"] = 2.0, 43.0
-    found = hyperparameters(config, Backbone(channels=4), result)
+    found = hyperparameters(config, Backbone(small_ctm(k=4)), result)
     assert (found["exposure"], found["ctm.k"], found["ctm.weights.enc"], found["loss"]) == (1.0, 4, 0.0, "mse")
     assert (found["ctm.strength"], found["loss.weight"]) == (2.0, 43.0)
     assert "ctm.P" not in found  # a list has no place on an axis

@@ -47,10 +47,10 @@ class Glow(RadianceBackbone):
 
     Config = GlowConfig
 
-    def __init__(self, config, scene, channels=3, photometric=None, seed=0):
-        super().__init__(scene, config.rays, channels, photometric, seed)
+    def __init__(self, config, scene, transform=None, photometric=None, seed=0):
+        super().__init__(scene, config.rays, transform, photometric, seed)
         self.total_steps = config.steps
-        self.layer = nn.Linear(3, channels)
+        self.layer = nn.Linear(3, self.channels)
 
     def render(self, rays, background, draws):
         depth = torch.full_like(rays.origins[:, 0], self.scene.far)

@@ -7,7 +7,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ctm_plugin.rays.contraction import INFINITY, RADIUS, contract, lengths, paced, travelled
+from ctm_plugin.rays.contraction import BALL_RADIUS, END_PACE, contract, lengths, paced, travelled
 
 SEED = st.integers(0, 10**6)
 
@@ -22,7 +22,7 @@ def points(seed: int, size: float, count: int = 50) -> torch.Tensor:
 def test_all_of_space_lies_in_the_ball_on_its_rays(seed, size):
     x = points(seed, size)
     c = contract(x)
-    assert (c.norm(dim=1) < RADIUS).all()
+    assert (c.norm(dim=1) < BALL_RADIUS).all()
     inside = x.norm(dim=1) <= 1
     assert torch.equal(c[inside], x[inside])
     norm = x[~inside].norm(dim=1)
@@ -53,7 +53,7 @@ def test_nothing_is_drawn_longer(seed, size):
 def test_paces_and_distances(distance):
     far = torch.tensor([distance], dtype=torch.float64)
     pace = paced(far)
-    assert 0 < pace.item() < INFINITY
+    assert 0 < pace.item() < END_PACE
     torch.testing.assert_close(travelled(pace), far, rtol=1e-6, atol=0)
 
 
@@ -66,12 +66,12 @@ def test_paces_go_on_smoothly():
 @pytest.mark.parametrize("away", [0.0, 0.5, 1.0])
 def test_a_ray_s_length_in_the_ball(away):
     """Straight out from the middle: all that is left of the ball, by the contraction itself."""
-    pace = torch.linspace(0, INFINITY, 100_001, dtype=torch.float64)[:-1]
+    pace = torch.linspace(0, END_PACE, 100_001, dtype=torch.float64)[:-1]
     middle = (pace[1:] + pace[:-1]) / 2
     places = torch.tensor([[away, 0.0, 0.0]], dtype=torch.float64) + travelled(middle)[:, None] * torch.tensor(
         [[1.0, 0.0, 0.0]], dtype=torch.float64
     )
     c = contract(places)
     found = (lengths(middle, c) * pace.diff()).sum().item()
-    assert found == pytest.approx(RADIUS - away, rel=1e-3)
+    assert found == pytest.approx(BALL_RADIUS - away, rel=1e-3)
     assert math.isfinite(found)

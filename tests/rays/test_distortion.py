@@ -9,7 +9,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ctm_plugin.data.readers.lens import Camera, check_lens
+from ctm_plugin.data.readers.lens import Intrinsics, check_lens
 from ctm_plugin.errors import DataError
 from ctm_plugin.rays.cameras import camera_rays, distort, distortion_slopes, pixel_rays, undistort
 from ctm_plugin.scene.frustum import frustum_box, view_counts, widest
@@ -128,7 +128,7 @@ def test_points_that_the_polynomial_folds_into_the_image_are_not_seen():
 
 @given(LENS)
 def test_photographic_lenses_pass(lens):
-    check_lens(Camera(800, 600, 800.0, 800.0, 400.0, 300.0, lens, "camera 1"), Path("cameras.bin"))
+    check_lens(Intrinsics(800, 600, 800.0, 800.0, 400.0, 300.0, lens, "camera 1"), Path("cameras.bin"))
 
 
 @pytest.mark.parametrize(
@@ -136,4 +136,4 @@ def test_photographic_lenses_pass(lens):
 )
 def test_lenses_that_fold(lens):
     with pytest.raises(DataError, match=r"cameras\.bin: found camera 1 with distortion .*expected a lens that maps on"):
-        check_lens(Camera(800, 600, 500.0, 500.0, 400.0, 300.0, lens, "camera 1"), Path("cameras.bin"))
+        check_lens(Intrinsics(800, 600, 500.0, 500.0, 400.0, 300.0, lens, "camera 1"), Path("cameras.bin"))

@@ -2,7 +2,7 @@
 
 import torch
 
-from ctm_plugin.rays.hash_density import DENSEST, lit, log_density
+from ctm_plugin.rays.hash_density import MAX_LOG_DENSITY, lit, log_density
 from ctm_plugin.rays.hash_grid import HashGrid
 
 
@@ -18,7 +18,7 @@ def test_samples_that_light_reaches():
     kept, features = lit(*network, points, lengths, ray_index, 25, 0.05)
     raw = last(first(grid(points)).relu())[:, 0].double()
     torch.testing.assert_close(log_density(*network, points).double(), raw, atol=1e-5, rtol=1e-5)
-    alpha = 1 - (-raw.clamp_max(DENSEST).exp() * lengths).exp()
+    alpha = 1 - (-raw.clamp_max(MAX_LOG_DENSITY).exp() * lengths).exp()
     expected = [
         12 * ray + at
         for ray, row in enumerate(alpha.view(25, 12))
@@ -30,6 +30,6 @@ def test_samples_that_light_reaches():
     torch.testing.assert_close(features, grid(points)[kept], atol=1e-6, rtol=0)
     with torch.no_grad():
         last.bias[0] += 1000.0
-    assert log_density(*network, points).min() > DENSEST
+    assert log_density(*network, points).min() > MAX_LOG_DENSITY
     only, _ = lit(*network, points, torch.tensor([1e-8]), ray_index, 25, 1e-3)
     assert len(only) == 300  # exp(15) * 1e-8 of alpha each

@@ -87,7 +87,7 @@ def test_points_in_blocks_are_those_in_one(count, monkeypatch):
     grid, points, grad = HashGrid(3, 2, 1 << 8, 3, 20), rand(count, 3), rand(count, 6, seed=1)
     given = points, grid.sides, grid.starts
     whole = encoded.reference(grid.table.detach(), *given), spread.reference(grad, *given, grid.table.shape)
-    monkeypatch.setattr("ctm_plugin.rays.hash_grid.BLOCK", 7)
+    monkeypatch.setattr("ctm_plugin.rays.hash_grid.POINT_BLOCK", 7)
     blocks = encoded.reference(grid.table.detach(), *given), spread.reference(grad, *given, grid.table.shape)
     torch.testing.assert_close(blocks, whole)
 

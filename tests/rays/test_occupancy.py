@@ -45,7 +45,7 @@ def test_no_ray_is_missed(shape, size, solid, seed):
     origins, offset, step = origins_of(count, rng), torch.rand(count, generator=rng), 0.5 * grid.voxel
     rays = Rays(origins, F.normalize(target - origins, dim=1))
     enter, leave = intersect_box(rays, box, NEAR, FAR)
-    counts, buffers = sample_counts(enter, leave, step, offset), (grid.box[0], grid.scale, grid.last, grid.offsets)
+    counts, buffers = sample_counts(enter, leave, step, offset), (grid.aabb[0], grid.scale, grid.last, grid.offsets)
     found = torch.zeros(count, dtype=torch.bool)
     found[occupied_samples(*rays, enter + offset * step, counts, step, occupancy.flatten(), *buffers)[1]] = True
     assert not (found & ~may_meet(rays, enter, leave, grid, occupancy.flatten())).any()

@@ -1,16 +1,17 @@
-"""``ctm report format=evidence``: rows of docs/evidence/scores.csv out of run folders."""
+"""``docs/evidence/scores.py``: rows of scores.csv out of run folders."""
 
 import csv
 import io
 from pathlib import Path
 
 import pytest
+from pages import load
 
-from ctm_plugin import cli
-from ctm_plugin.report.evidence import COLUMNS, evidence
 from ctm_plugin.report.runs import read_run
 
 ROOT = Path(__file__).parents[2]
+subject = load("docs/evidence/scores.py")
+COLUMNS, evidence = subject.COLUMNS, subject.evidence
 VERSIONS = {"version": "0.1.0 0123456789ab+", "versions": {"torch": "2.13.0+cpu"}}
 
 
@@ -72,12 +73,12 @@ def test_rows_are_added_and_a_run_replaces_its_own(made, tmp_path, capsys):
     out.write_text((ROOT / "docs/evidence/scores.csv").read_text().splitlines()[0] + ",peak_memory_mb\n")
     made("seed=0", psnr=31.0, **VERSIONS)
     made("seed=1", psnr=32.0, peak_memory_mb=250.0, **VERSIONS)
-    arguments = ["report", str(tmp_path / "runs"), "format=evidence"]
-    assert cli.main([*arguments, f"out={out}"]) == 0
+    arguments = [str(tmp_path / "runs")]
+    subject.main([*arguments, f"out={out}"])
     made("seed=0", psnr=33.0, **VERSIONS)
     made("seed=0", psnr=34.0, **VERSIONS | {"version": "0.1.0 ba9876543210"})
     (tmp_path / "runs/001/metrics.json").unlink()
-    assert cli.main([*arguments, f"out={out}"]) == 0
+    subject.main([*arguments, f"out={out}"])
     assert "left out: " in capsys.readouterr().err
     found = [(row["seed"], row["commit"], row["psnr"], row["peak_memory_mb"]) for row in rows(out.read_text())]
     assert found == [
@@ -85,7 +86,7 @@ def test_rows_are_added_and_a_run_replaces_its_own(made, tmp_path, capsys):
         ("1", "0123456", "32.0000", "250.00"),
         ("0", "ba98765", "34.0000", ""),
     ]
-    assert cli.main(arguments) == 0
+    subject.main(arguments)
     assert len(rows(capsys.readouterr().out)) == 3
 
 

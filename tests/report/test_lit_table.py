@@ -100,14 +100,14 @@ def test_lit_runs_have_one_table_and_others_theirs(lit, made, capsys):
 def test_appearances_have_rows_of_their_own_and_a_column(lit, capsys):
     """Scenes stand apart by how their pictures were exposed; without an appearance anywhere nothing is new."""
     lit("room", "appearance=none", lom=False, psnr_fitted=40.0, data="a")
-    for appearance, fitted in (("none", 35.0), ("affine", 39.0), ("bilateral", 38.0)):
+    for appearance, fitted in (("none", 35.0), ("exposure", 39.0)):
         folder = lit("room", f"appearance={appearance}", lom=False, psnr_fitted=fitted, data="b")
         put(folder / "config.yaml", "dataset.exposure", 0.5)
     assert main(["report", str(folder.parent)]) == 0
     text = capsys.readouterr().out
     assert "light fitted to the left" in text
     assert "room (dataset.exposure=1): backbone=dvgo ctm=" in text
-    assert "room (dataset.exposure=0.5): appearance=affine" in text
+    assert "room (dataset.exposure=0.5): appearance=exposure" in text
     assert "39.00" in text
 
 

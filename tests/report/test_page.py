@@ -5,7 +5,7 @@ import pytest
 from torch.utils.tensorboard import SummaryWriter
 
 from ctm_plugin.report.labels import find_runs
-from ctm_plugin.report.page import Curve, curves, curves_of, first_seeds, shown, windows_of
+from ctm_plugin.report.page import Curve, curves, curves_of, first_seeds, scene_entry, windows_of
 
 
 def log(folder, **curves: list[float]) -> None:
@@ -49,7 +49,7 @@ def test_no_curves(tmp_path):
 
 def test_a_single_run_beside_the_photograph(made):
     (run,) = find_runs([made("ctm=off", views=True)]).runs
-    page = shown(run.scene, [run])
+    page = scene_entry(run.scene, [run])
     assert page["names"] == {0: "photograph", 1: "backbone=dvgo ctm=off 30.00 dB"}
     assert page["sides"] == (0, 1)
     assert {each["title"]: (list(each["layers"]), each["sides"]) for each in page["sliders"]} == {
@@ -65,7 +65,7 @@ def test_any_number_of_runs_under_one_slider(made):
     made("ctm=off", "color_space=lab", dataset="room", protocol="room")
     found = first_seeds(find_runs([folder.parent]).runs)
     assert {scene: len(runs) for scene, runs in found.items()} == {"room": 1, "still_life": 3}
-    page = shown("still_life", found["still_life"])
+    page = scene_entry("still_life", found["still_life"])
     assert list(page["names"].values()) == [
         "photograph",
         "ctm=off 30.00 dB",
@@ -73,14 +73,14 @@ def test_any_number_of_runs_under_one_slider(made):
         "ctm=on 30.00 dB",
     ]
     assert page["sides"] == (1, 3)  # what is told apart by CTM alone
-    assert shown("room", found["room"])["sliders"] == []
+    assert scene_entry("room", found["room"])["sliders"] == []
 
 
 def test_it_opens_on_plain_rgb_and_the_recommendation(made):
     for arguments in (["ctm=quick"], ["ctm=auto"], ["ctm=off", "color_space=lab"], ["ctm=off"]):
         folder = made(*arguments, views=True)
     (runs,) = first_seeds(find_runs([folder.parent]).runs).values()
-    page = shown("still_life", runs)
+    page = scene_entry("still_life", runs)
     assert [page["names"][side] for side in page["sides"]] == ["ctm=off 30.00 dB", "ctm=auto 30.00 dB"]
     assert all(each["sides"] == list(page["sides"]) for each in page["sliders"])
 

@@ -9,7 +9,7 @@ import pytest
 
 from ctm_plugin.cli import main
 from ctm_plugin.errors import CheckpointError, ConfigError
-from ctm_plugin.runs.data import DATA, located
+from ctm_plugin.runs.data import DATA_FILE, located
 from ctm_plugin.runs.load import load_posed
 from ctm_plugin.runs.rundir import LAST, METRICS
 
@@ -30,9 +30,9 @@ def pair(ball, tmp_path_factory) -> Path:
 def here(pair, tmp_path, monkeypatch) -> Path:
     """A copy of it, without the first one's path to fall back on, seen from elsewhere."""
     home = Path(shutil.copytree(pair, tmp_path / "here"))
-    note = json.loads((home / "run" / DATA).read_text())
+    note = json.loads((home / "run" / DATA_FILE).read_text())
     assert note["root"] == str(pair / "ball")
-    (home / "run" / DATA).write_text(json.dumps(note | {"root": str(home / "ball")}))
+    (home / "run" / DATA_FILE).write_text(json.dumps(note | {"root": str(home / "ball")}))
     (tmp_path / "elsewhere").mkdir()
     monkeypatch.chdir(tmp_path / "elsewhere")
     return home
@@ -55,7 +55,7 @@ def test_from_another_working_directory(here, expected, moved):
 
 
 def test_without_a_note(here):
-    (here / "run" / DATA).unlink()
+    (here / "run" / DATA_FILE).unlink()
     config = {"dataset": {"name": "blender", "root": "ball"}}
     assert located(config, here / "run")["dataset"]["root"] == str(here / "ball")
     with pytest.raises(CheckpointError, match="found none of its data at gone, expected them there, or"):

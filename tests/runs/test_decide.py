@@ -1,8 +1,15 @@
 """What is left to the program: decided by what the capture is, said, and never against what was given."""
 
+from collections import Counter
+
 import pytest
 import torch
+from PIL import Image
 
+from ctm_plugin.cli import main
+from ctm_plugin.data.blender import BlenderConfig
+from ctm_plugin.data.llff import LLFFConfig
+from ctm_plugin.data.readers import records as reading
 from ctm_plugin.data.rig import Rig
 from ctm_plugin.runs import decide
 from ctm_plugin.runs.compose import compose
@@ -49,7 +56,6 @@ def test_the_budget_goes_by_pixels_and_device(monkeypatch, size, gpu, expected):
 @pytest.mark.parametrize(("backbone", "given", "gpu", "installed", "expected"), [
     ("splat", "auto", True, (), "cpu"),
     ("splat", "auto", True, ("triton",), "auto"),
-    ("splat", "auto", True, ("gsplat",), "auto"),
     ("splat", "gpu", True, (), "gpu"),
     ("splat", "auto", False, (), "auto"),
     ("dvgo", "auto", True, (), "auto"),
@@ -63,3 +69,27 @@ def test_splats_stay_on_the_processor_where_a_gpu_has_nothing_to_composite_them_
     assert config["trainer"]["accelerator"] == expected
     assert ("trainer.accelerator=cpu: splats on a GPU need" in capsys.readouterr().err) == (expected == "cpu")
     assert config["trainer"]["budget"] == ("standard" if gpu and expected != "cpu" else "quick")
+
+
+@pytest.mark.parametrize(("scene", "records"), [("ball", 2), ("hall", 0)])
+def test_what_it_read_is_not_read_again(request, small, untrained, monkeypatch, scene, records):
+    """From a folder to the first step: a file with cameras, and a picture's header and its pixels, once each."""
+    root, times = request.getfixturevalue(scene), Counter()
+
+    def counted(module, name):
+        own = getattr(module, name)
+
+        def function(*args, **named):
+            times[name] += 1
+            return own(*args, **named)
+
+        monkeypatch.setattr(module, name, function)
+
+    for module, name in ((BlenderConfig, "capture"), (LLFFConfig, "capture"), (Image, "open")):
+        counted(module, name)
+    counted(reading, "parse_record")
+    with pytest.raises(AssertionError, match="training has begun"):
+        main([f"dataset.root={root}", "backbone=dvgo", "ctm=off", *small[2:]])
+    pictures = [path for path in root.rglob("*.png") if not path.stem.endswith("_depth")]
+    depths = list(root.glob("test/*_depth.png"))
+    assert times == {"capture": 1, "open": 2 * len(pictures) + len(depths)} | ({"parse_record": 2} if records else {})

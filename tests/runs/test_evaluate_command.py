@@ -191,10 +191,10 @@ class OneColor(Backbone):
 
     Config, Scene, batch_rays = OneColorConfig, SimpleNamespace, 4
 
-    def __init__(self, config, scene, channels=3, photometric=None, seed=0):
-        super().__init__(channels, photometric, seed)
+    def __init__(self, config, scene, transform=None, photometric=None, seed=0):
+        super().__init__(transform, photometric, seed)
         self.scene, self.total_steps = scene, config.steps
-        self.color = torch.nn.Parameter(torch.zeros(channels))
+        self.color = torch.nn.Parameter(torch.zeros(self.channels))
 
     def draw(self, draws):
         return Batch(torch.full((4, 3), self.scene.level))

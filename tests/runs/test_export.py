@@ -26,12 +26,12 @@ from ctm_plugin.errors import CTMError
 from ctm_plugin.rays.cameras import Rays, pixel_rays
 from ctm_plugin.runs.export import write_cameras, write_surface
 from ctm_plugin.runs.load import load_posed
-from ctm_plugin.runs.surface import THICKNESS, Surface, cloud, mesh
+from ctm_plugin.runs.surface import LAYER_THICKNESS, Surface, cloud, mesh
 from ctm_plugin.scene.views import Scene
 
 RADIUS, CENTRE = 0.8, (0.1, -0.05, 0.0)
 BOX = [[-1.2, -1.1, -1.0], [1.2, 1.1, 1.0]]
-LAYER = 2.4 * THICKNESS
+LAYER = 2.4 * LAYER_THICKNESS
 COLOUR = (0.3, 0.1, 0.02)
 
 

@@ -9,12 +9,12 @@ import torch
 from test_export import parsed
 
 from ctm_plugin.backbones.settings import SplatConfig
-from ctm_plugin.backbones.splat import NEAREST, Splat
+from ctm_plugin.backbones.splat import NEAR_FRACTION, Splat
 from ctm_plugin.cli import main
 from ctm_plugin.color.light import Light
 from ctm_plugin.data.llff import LLFFConfig
 from ctm_plugin.runs.load import load_posed
-from ctm_plugin.runs.splats import cameras_in_files, in_files, likeness, read_splats, shown, write_splats
+from ctm_plugin.runs.splats import cameras_in_files, in_files, likeness, read_splats, render_splats, write_splats
 from ctm_plugin.runs.surface import spanned
 from ctm_plugin.splats.gaussians import Gaussians, camera_of, colors_seen
 
@@ -22,9 +22,9 @@ from ctm_plugin.splats.gaussians import Gaussians, camera_of, colors_seen
 def some(count: int) -> Gaussians:
     """Random ones before a camera that looks along -z."""
     means = torch.randn(count, 3) * 0.5 - torch.tensor([0.0, 0.0, 3.0])
-    scales, turns = torch.randn(count, 3) * 0.3 - 2, torch.randn(count, 4)
-    opacities, base, rest = torch.randn(count, 1), torch.randn(count, 3), 0.2 * torch.randn(count, 45)
-    return Gaussians(means, scales, turns, opacities, base, rest)
+    scales, quats = torch.randn(count, 3) * 0.3 - 2, torch.randn(count, 4)
+    opacities, sh0, shN = torch.randn(count, 1), torch.randn(count, 3), 0.2 * torch.randn(count, 45)
+    return Gaussians(means, scales, quats, opacities, sh0, shN)
 
 
 def columns(path: Path) -> dict[str, np.ndarray]:
@@ -64,8 +64,8 @@ def test_a_file_is_read_back(tmp_path):
     given = some(50)
     write_splats(tmp_path / "a.ply", given)
     back = read_splats(tmp_path / "a.ply")
-    turns = torch.nn.functional.normalize(given.turns, dim=1)
-    torch.testing.assert_close(tuple(back), tuple(given._replace(turns=turns)), atol=1e-6, rtol=0)
+    quats = torch.nn.functional.normalize(given.quats, dim=1)
+    torch.testing.assert_close(tuple(back), tuple(given._replace(quats=quats)), atol=1e-6, rtol=0)
 
 
 def test_colours_are_the_format_s(tmp_path):
@@ -88,14 +88,14 @@ def test_the_world_is_the_files(hall):
     module, views = Splat(SplatConfig(first=80), scene), scene.test
     assert scene.world.scale != 1
     given = some(200)
-    given = given._replace(means=given.means * torch.tensor([1.0, 1.0, 2.0]), rest=torch.zeros(200, 0))
+    given = given._replace(means=given.means * torch.tensor([1.0, 1.0, 2.0]), shN=torch.zeros(200, 0))
     there, cameras = in_files(given, scene), cameras_in_files(module, views)
     plain = LLFFConfig(root=hall, geometry="bounded").load().test
     for index, camera in enumerate(cameras):
         torch.testing.assert_close(camera.centre, plain.c2w[index, :, 3], atol=1e-5, rtol=0)
-        ours = camera_of(views, index, NEAREST * scene.near)
-        want = shown(given, ours, torch.ones(3))
-        torch.testing.assert_close(shown(there, camera, torch.ones(3)), want, atol=1e-3, rtol=0)
+        ours = camera_of(views, index, NEAR_FRACTION * scene.near)
+        want = render_splats(given, ours, torch.ones(3))
+        torch.testing.assert_close(render_splats(there, camera, torch.ones(3)), want, atol=1e-3, rtol=0)
         assert want.std() > 0.1
         assert camera.near == pytest.approx(ours.near / scene.world.scale)
 
@@ -120,7 +120,7 @@ def run(tmp_path_factory) -> Path:
 
 
 def test_lit_splats_from_the_command_line(run, capsys, refused, tmp_path, monkeypatch):
-    monkeypatch.setattr("ctm_plugin.runs.export.STEPS", 100)
+    monkeypatch.setattr("ctm_plugin.runs.export.TRAIN_STEPS", 100)
     assert main(["export", str(run)]) == 0
     file, told = run / "export/splats.ply", capsys.readouterr().out
     assert f"written to {file}" in told

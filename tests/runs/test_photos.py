@@ -31,8 +31,9 @@ def test_from_a_folder_to_lit_views_and_a_film(capture, capsys):
     assert names == {path.name for path in (run / "photo").iterdir()} == {"00.png", "08.png", "16.png"}
     (film,) = (run / "video").iterdir()
     assert (run / "index.html").stat().st_size < 10_000_000
+    assert len(list((run / "all").iterdir())) == 17
     assert said.out.splitlines()[-5:] == [
-        f"lit views: {run / 'lit'}",
+        f"lit views: {run / 'all'}",
         f"film:      {film}",
         f"scores:    {run / 'metrics.json'}",
         f"all of it: {run / 'index.html'}",
@@ -96,7 +97,7 @@ def test_photographs_that_were_added_are_searched_anew(capture, monkeypatch, cap
 
 @pytest.mark.parametrize(
     ("spread", "more", "expected"),
-    [(0.3, (), True), (0.04, (), False), (0.3, ("appearance=affine",), False), (0.3, ("+appearance=none",), False)],
+    [(0.3, (), True), (0.04, (), False), (0.3, ("appearance=none",), False), (0.3, ("+appearance=none",), False)],
 )
 def test_uneven_photographs_are_evened_unless_told_otherwise(capture, monkeypatch, spread, more, expected):
     monkeypatch.setattr("ctm_plugin.cameras.exposures.spread_of_gains", lambda root: spread)

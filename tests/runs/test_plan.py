@@ -7,7 +7,7 @@ import torch
 
 from ctm_plugin.runs import plan as module
 from ctm_plugin.runs.assemble import assemble
-from ctm_plugin.runs.plan import LEAST, REFERENCE, STEPS, WIDEST, Plan, Timed, plan, timed_steps
+from ctm_plugin.runs.plan import BUDGET_STEPS, COLUMNS, MAX_COLUMNS, REFERENCE, Plan, Timed, plan, timed_steps
 
 PHOTOS = (3000, 4000)
 
@@ -16,11 +16,11 @@ PHOTOS = (3000, 4000)
 def test_more_minutes_give_larger_pictures_and_more_steps(slower):
     timed = Timed(slower * REFERENCE.seconds, REFERENCE.pixels)
     plans = [plan(PHOTOS, minutes, timed) for minutes in (0.05, 0.3, 1.0, 3.0, 10.0, 60.0, 600.0)]
-    widths = {budget: [each.width for each in plans if each.budget == budget] for budget in STEPS}
+    widths = {budget: [each.width for each in plans if each.budget == budget] for budget in BUDGET_STEPS}
     assert all(each == sorted(each) for each in widths.values())
-    assert plans[0][:2] == (LEAST["quick"], "quick")
+    assert plans[0][:2] == (COLUMNS["quick"], "quick")
     assert "minutes=0.01 is too short here: it takes about" in plan(PHOTOS, 0.01, timed).told
-    assert plans[-1][:2] == (WIDEST, "standard")
+    assert plans[-1][:2] == (MAX_COLUMNS, "standard")
     assert plan((300, 400), 600.0, timed) == Plan(400, "standard")  # never larger than the photographs
 
 
@@ -28,10 +28,10 @@ def test_more_minutes_give_larger_pictures_and_more_steps(slower):
 @pytest.mark.parametrize("minutes", [1.5, 6.0, 12.0])
 def test_what_is_chosen_takes_so_many_minutes(minutes, threads):
     found = plan(PHOTOS, minutes, REFERENCE, threads)
-    assert LEAST[found.budget] < found.width < WIDEST
+    assert COLUMNS[found.budget] < found.width < MAX_COLUMNS
     assert module._minutes(PHOTOS, found.width, found.budget, REFERENCE, threads) == pytest.approx(minutes, rel=0.02)
     wider, more = (part.partition("=")[2] for part in found.told.split(": ")[1].split())
-    budget = "standard" if int(wider) >= LEAST["standard"] else "quick"
+    budget = "standard" if int(wider) >= COLUMNS["standard"] else "quick"
     takes = module._minutes(PHOTOS, int(wider), budget, REFERENCE, threads)
     assert takes <= int(more) < takes + 1
 
@@ -39,7 +39,7 @@ def test_what_is_chosen_takes_so_many_minutes(minutes, threads):
 def test_a_width_that_is_given_stays():
     assert plan((750, 1000), 60.0, REFERENCE, given=True) == Plan(1000, "standard")
     assert plan((750, 1000), 0.1, REFERENCE, given=True).width == 1000
-    assert plan((1200, 1600), 10.0, None) == Plan(WIDEST, "standard")  # a GPU
+    assert plan((1200, 1600), 10.0, None) == Plan(MAX_COLUMNS, "standard")  # a GPU
 
 
 def test_a_step_is_timed_by_what_it_computes_itself(compose, monkeypatch):

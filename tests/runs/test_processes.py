@@ -23,7 +23,7 @@ from ctm_plugin.runs.train import train
 # Pre-training, the change of stage after 4 steps, a growth after 2 more, the occupancy grid one later; 8 steps of 2
 # batches. Learning rates are large enough for the coarse stage to find the ball.
 STAGES = (
-    "dataset.background=random_matched", "appearance=affine", "ctm.lr=0.01", "ctm.pretrain_steps=100",
+    "dataset.background=random_matched", "appearance=exposure", "ctm.lr=0.01", "ctm.pretrain_steps=100",
     "backbone.coarse=true", "backbone.coarse_steps=4", "backbone.coarse_lr_grid=8", "backbone.steps=4",
     "backbone.grow=[2]", "backbone.occupancy_first=3", "backbone.rays=128", "trainer.accelerator=cpu",
     "trainer.accumulate_grad_batches=2",

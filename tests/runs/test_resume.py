@@ -17,8 +17,8 @@ from ctm_plugin.backbones.dvgo import DVGO
 from ctm_plugin.color.ctm import CTM
 from ctm_plugin.errors import CheckpointError, Interrupted
 from ctm_plugin.runs import rundir
-from ctm_plugin.runs.cameras import CAMERAS
-from ctm_plugin.runs.data import DATA
+from ctm_plugin.runs.cameras import CAMERAS_FILE
+from ctm_plugin.runs.data import DATA_FILE
 from ctm_plugin.runs.evaluate import evaluate
 from ctm_plugin.runs.load import load_checkpoint
 from ctm_plugin.runs.rundir import CONFIG, LAST, METRICS, load_config
@@ -27,7 +27,7 @@ from ctm_plugin.runs.train import resume, train
 # 12 steps of 2 batches: 4 coarse ones, then 8 fine ones that grow at 3 and 5 and renew the occupancy at 2 and 6.
 # Learning rates are large enough for the coarse stage to find the ball.
 STAGES = (
-    "dataset.background=random_matched", "appearance=affine", "ctm.lr=0.01", "ctm.pretrain_steps=100",
+    "dataset.background=random_matched", "appearance=exposure", "ctm.lr=0.01", "ctm.pretrain_steps=100",
     "ctm.lr_decay=0.5", "backbone.coarse=true", "backbone.coarse_steps=4", "backbone.steps=8", "backbone.grow=[3,5]",
     "backbone.restart=false", "backbone.shift_drop=0.5", "backbone.occupancy_first=2", "backbone.coarse_lr_grid=8",
     "backbone.lr_grid=4", "backbone.averaged=4", "backbone.rays=128", "trainer.accumulate_grad_batches=2",
@@ -110,7 +110,7 @@ def test_interrupted_in_every_step(whole, config, tmp_path, ctrl_c):
 
 @pytest.mark.parametrize(("kind", "batch"), [("planes", 9), ("nerf", 5), ("ngp", 13), ("settled", 8)])
 def test_other_fields(compose, hall, tmp_path, ctrl_c, monkeypatch, kind, batch):
-    monkeypatch.setattr("ctm_plugin.backbones.ngp.SETTLED", 1)
+    monkeypatch.setattr("ctm_plugin.backbones.ngp.SETTLING_UPDATES", 1)
     config = compose(*OTHERS[kind], *((f"dataset.root={hall}",) if kind == "planes" else ()))
     train(config, tmp_path / "whole")
     ctrl_c(lambda seen: seen == batch)
@@ -136,7 +136,7 @@ def test_interrupted_in_pretraining_starts_again(whole, config, tmp_path, monkey
     run = tmp_path / "run"
     with pytest.raises(Interrupted, match="stopped before the first step; go on with"):
         train(config, run)
-    assert {path.name for path in run.iterdir() if path.is_file()} == {CONFIG, DATA, CAMERAS}
+    assert {path.name for path in run.iterdir() if path.is_file()} == {CONFIG, DATA_FILE, CAMERAS_FILE}
     assert cli.main([f"+resume={run}"]) == 0
     assert len(calls) == 150
     same(run, whole)

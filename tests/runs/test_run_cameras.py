@@ -19,7 +19,7 @@ from ctm_plugin.cli import main
 from ctm_plugin.data.blender import BlenderConfig
 from ctm_plugin.errors import CheckpointError
 from ctm_plugin.files import write_json
-from ctm_plugin.runs.cameras import CAMERAS, note_cameras, noted_scene
+from ctm_plugin.runs.cameras import CAMERAS_FILE, note_cameras, noted_scene
 from ctm_plugin.runs.rundir import METRICS
 from ctm_plugin.scene.poses import Similarity
 from ctm_plugin.scene.views import Scene
@@ -43,14 +43,14 @@ def made(run: Path, out: str) -> dict[str, bytes]:
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_same_files_with_and_without_photographs(ball, tmp_path, monkeypatch, capsys, kind):
-    monkeypatch.setattr("ctm_plugin.runs.splats.STEPS", 3)
+    monkeypatch.setattr("ctm_plugin.runs.splats.TRAIN_STEPS", 3)
     shutil.copytree(ball, tmp_path / "ball")
     run = tmp_path / kind
     data = ("dataset=blender", f"dataset.root={tmp_path / 'ball'}", "dataset.exposure=0.05")
     assert main([*data, *KINDS[kind], "trainer=smoke", "logger=none", f"hydra.run.dir={run}"]) == 0
     expected = made(run, "with")
     shutil.rmtree(tmp_path / "ball")
-    with pytest.warns(UserWarning, match=f"{kind}: its photographs are gone; it goes by the cameras in {CAMERAS}"):
+    with pytest.warns(UserWarning, match=f"{kind}: its photographs are gone; it goes by the cameras in {CAMERAS_FILE}"):
         assert made(run, "without") == expected
     captured, lit = (list((run / "without" / what).rglob("*.png")) for what in ("cameras", "pictures"))
     assert (len(captured), len(lit)) == (0, 10)
@@ -132,9 +132,11 @@ def test_older_runs_have_none(tmp_path):
 )
 def test_what_cannot_be_used_is_refused(scene, tmp_path, key, value):
     note_cameras(tmp_path, NeRF(NeRFConfig(), scene))
-    note = json.loads((tmp_path / CAMERAS).read_text())
+    note = json.loads((tmp_path / CAMERAS_FILE).read_text())
     *parents, last = [int(part) if part.isdigit() else part for part in key.split(".")]
     reduce(getitem, parents, note)[last] = value
-    (tmp_path / CAMERAS).write_text(json.dumps(note))
-    with pytest.raises(CheckpointError, match=rf"{CAMERAS}: found no cameras \(.*\), expected what a run writes there"):
+    (tmp_path / CAMERAS_FILE).write_text(json.dumps(note))
+    with pytest.raises(
+        CheckpointError, match=rf"{CAMERAS_FILE}: found no cameras \(.*\), expected what a run writes there"
+    ):
         noted_scene(tmp_path)

@@ -28,8 +28,8 @@ def run(trained) -> Path:
 @pytest.fixture
 def own(run, tmp_path, monkeypatch) -> Path:
     """One to write into, with a name that would be markup."""
-    monkeypatch.setattr(pages, "STEPS", 10)
-    monkeypatch.setattr(pages, "VIEWS", 4)
+    monkeypatch.setattr(pages, "COLOR_STEPS", 10)
+    monkeypatch.setattr(pages, "MAX_VIEWS", 4)
     return Path(shutil.copytree(run, tmp_path / "<b>run"))
 
 
@@ -46,8 +46,8 @@ def test_from_the_command_line(own, capsys, refused):
     told, page = capsys.readouterr().out, text_of(own)
     assert f"written to {own / 'index.html'}" in told
     assert f"the page has no film, as the run has none: ctm render '{own}'" in told
-    assert f"the page shows {pages.VIEWS} of {len(load_posed(own).module.scene.test)} test views" in told
-    assert pictures(page) == 3 * pages.VIEWS + 1  # lit, dark and brightened; and one behind the button
+    assert f"the page shows {pages.MAX_VIEWS} of {len(load_posed(own).module.scene.test)} test views" in told
+    assert pictures(page) == 3 * pages.MAX_VIEWS + 1  # lit, dark and brightened; and one behind the button
     assert "VISER_EMBED_DATA" in page
     assert "<b>run" not in page
     assert "overwrite=true" in refused("export", own, "what=page")
@@ -62,7 +62,7 @@ def test_a_film_that_fits(tmp_path, capsys, monkeypatch, film, kind):
     write_video(tmp_path / film, noise, fps=10)
     whole = base64.b64decode(pages.film_url(tmp_path / film).removeprefix(f"data:{kind};base64,"))
     assert capsys.readouterr().out == ""
-    monkeypatch.setattr(pages, "MOST_OF_FILM", int(0.7 * len(whole)))
+    monkeypatch.setattr(pages, "MAX_FILM_BYTES", int(0.7 * len(whole)))
     (tmp_path / "b").write_bytes(base64.b64decode(pages.film_url(tmp_path / film).partition(",")[2]))
     small = iio.imread(tmp_path / "b", extension="." + kind[6:], index=None if kind == "video/mp4" else ...)
     assert len(small) == 6
@@ -75,16 +75,16 @@ def test_all_is_made_smaller_until_it_fits(own, capsys, monkeypatch):
     (own / "video").mkdir()
     noise = np.random.default_rng(0).integers(0, 255, (6, 64, 64, 3), np.uint8)
     write_video(own / "video/a.gif", list(noise), fps=10)
-    monkeypatch.setattr(pages, "MOST_OF_FILM", 15_000)
-    monkeypatch.setattr(pages, "MOST_OF_PICTURES", 3_000)
-    monkeypatch.setattr(pages, "MOST", pages.VIEWER + 60_000)
+    monkeypatch.setattr(pages, "MAX_FILM_BYTES", 15_000)
+    monkeypatch.setattr(pages, "MAX_PICTURE_BYTES", 3_000)
+    monkeypatch.setattr(pages, "LIMIT", pages.VIEWER_BYTES + 60_000)
     write_page(own / "index.html", own, posed, posed.light)
     told, page = capsys.readouterr().out, text_of(own)
     assert "the page shows 4 of " in told
     assert re.search(r"the page's pictures are \d+ pixels wide, of 64: it is to have less than ", told)
     assert re.search(r"the page's film is \d+ pixels wide, of 64 in ", told)
     assert re.search(r"the page's walk has [\d,]+ of [\d,]+ spots", told)
-    assert len(page.encode()) < pages.MOST
+    assert len(page.encode()) < pages.LIMIT
     assert pictures(page) == 3 * 4 + 1 + 1
 
 
@@ -108,7 +108,7 @@ def test_of_places_without_photographs(own, monkeypatch):
     write_page(own / "index.html", own, posed, posed.light)
     assert "from places where nobody has taken a photograph" in text_of(own)
     assert 'class="stage compare"' not in text_of(own)
-    assert pictures(text_of(own)) == pages.VIEWS
+    assert pictures(text_of(own)) == pages.MAX_VIEWS
 
 
 @pytest.fixture(scope="module")

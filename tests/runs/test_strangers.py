@@ -1,4 +1,4 @@
-"""Run directories and files from strangers: nothing in them runs, and nothing outside them is read or written."""
+"""Run directories and files from strangers: nothing in them runs."""
 
 import json
 import os
@@ -8,15 +8,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from mutations import LAUGHS, Payload, put
+from mutations import Payload, put
 
 from ctm_plugin import __version__, cli
 from ctm_plugin.errors import CheckpointError, CTMError, DataError
 from ctm_plugin.metrics.lpips import feature_network
-from ctm_plugin.metrics.lpips_weights import MOST, load_lpips
+from ctm_plugin.metrics.lpips_weights import MAX_BYTES, load_lpips
 from ctm_plugin.runs.assemble import assemble
 from ctm_plugin.runs.load import restore
-from ctm_plugin.runs.rundir import CONFIG, LAST, METRICS, check_folder, load_config, read_yaml, save_config
+from ctm_plugin.runs.rundir import CONFIG, LAST, load_config, read_yaml, save_config
 from ctm_plugin.runs.train import resume
 
 
@@ -56,12 +56,12 @@ def test_interpolations_are_refused(stranger, text, key):
     "text",
     [
         "!!python/object/apply:os.system ['touch touched']", "a: !!python/name:os.system", "a: !!bool x",
-        "a: !!int ''", "a: !!set {b}", "a: !unknown b", "a: 2001-99-99", "a: &a [*a]", LAUGHS, "a: [", "a: *b",
-        "a: \x00", "\xff", "[" * 200_000 + "]" * 200_000, "a: " + "1" * 5000,
+        "a: !!int ''", "a: !unknown b", "a: 2001-99-99", "a: &a [*a]", "a: [", "a: *b", "a: \x00", "\xff",
+        "a: " + "1" * 5000,
     ],
 )  # fmt: skip
 def test_yaml_beyond_plain_values(stranger, tmp_path, monkeypatch, text):
-    """Tags make objects (or crash YAML's own parser), aliases make gigabytes of a few lines, or circles."""
+    """Tags make objects, or crash YAML's own parser."""
     monkeypatch.chdir(tmp_path)
     (stranger / CONFIG).write_bytes(text.encode("latin-1"))
     with pytest.raises(CheckpointError, match=f"{CONFIG}: found no readable YAML"):
@@ -123,7 +123,7 @@ def test_code_in_weights_of_lpips_does_not_run(tmp_path):
 def test_weights_that_are_small_only_when_packed(tmp_path, name):
     with zipfile.ZipFile(tmp_path / name, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
         archive.writestr("features.0.weight.npy", b"x")
-        archive.infolist()[0].file_size = MOST + 1
+        archive.infolist()[0].file_size = MAX_BYTES + 1
     with pytest.raises(DataError, match=rf"{name}: found an unreadable file \(BadZipFile\)"):
         load_lpips(tmp_path / name, "alex")
 
@@ -143,7 +143,7 @@ def adam(saved: dict) -> dict:
 
 COLOR = "field.color.layers.0.weight"
 ANOTHER, UNFIT = "a file of another kind, expected a checkpoint of ctm_plugin", r"weights that do not fit \(.*"
-CLAIMS, STATE = r"a tensor \[1099511627776\] that is not stored whole", "a state that cannot be restored"
+STATE = "a state that cannot be restored"
 
 
 @pytest.mark.parametrize(
@@ -155,14 +155,6 @@ CLAIMS, STATE = r"a tensor \[1099511627776\] that is not stored whole", "a state
         (lambda s: s.update(state_dict=[]), ANOTHER),
         (lambda s: s.update(batches_seen="3"), ANOTHER),
         (lambda s: s.pop("global_step"), ANOTHER),
-        (lambda s: adam(s).update(exp_avg=torch.zeros(1).expand(2**40)), CLAIMS),
-        (lambda s: adam(s).update(exp_avg=torch.sparse_coo_tensor([[0]], [1.0], (2**40,))), CLAIMS),
-        (lambda s: s["dvgo"].update(shape=[100_000] * 3), f"{UNFIT}a table of shape"),
-        (lambda s: s["dvgo"].update(shape=[-1, -1, 8]), f"{UNFIT}a table of shape"),
-        (lambda s: s["dvgo"].update(shape="abc"), UNFIT),
-        (lambda s: s["dvgo"].update(stage="final"), f"{UNFIT}stage 'final'"),
-        (lambda s: s["dvgo"].update(grown=10**9), f"{UNFIT}grown 1000000000 times"),
-        (lambda s: s["dvgo"].update(box=torch.full((2, 3), float("nan"))), f"{UNFIT}a box"),
         (lambda s: s["state_dict"][COLOR].fill_(torch.nan), f"{UNFIT}infinity in {COLOR}"),
         (lambda s: s["state_dict"].update({COLOR: torch.zeros(1)}), UNFIT + COLOR),
         (lambda s: s.pop("optimizer_states"), STATE),
@@ -182,32 +174,6 @@ def test_a_checkpoint_of_something_else(finished, monkeypatch, spoil, found):
     assert not Path("touched").exists()  # code of the last one
 
 
-# Out of the run.
-
-
-@pytest.mark.parametrize("name", [LAST, "checkpoints", "lit", "lit/r_0.png", METRICS, "error.txt"])
-def test_links_out_of_a_run_are_not_followed(finished, tmp_path, name):
-    path, secret = finished / name, tmp_path / "secret"
-    secret.mkdir()
-    if path.exists():
-        path.rename(secret / path.name)
-    path.symlink_to(secret / path.name)
-    expected = rf"{name}: found a link to {secret / path.name}, expected nothing that leads out of the run"
-    with pytest.raises(CheckpointError, match=expected):
-        resume(finished)
-    assert cli.main(["report", str(finished), f"out={finished.parent / 'report.md'}"]) == 1
-    assert not (finished.parent / "report.md").exists()
-
-
-def test_links_inside_a_run_and_pipes(finished):
-    (finished / "again").symlink_to("test")
-    (finished / "round").symlink_to("round")
-    check_folder(finished)
-    os.mkfifo(finished / "lit/pipe.png")
-    with pytest.raises(CheckpointError, match=r"lit/pipe.png: found something that is not a file"):
-        check_folder(finished)
-
-
 def test_what_the_machine_refuses_is_no_fault_of_the_checkpoint(finished, monkeypatch):
     def refuse(self, trainer):
         raise torch.OutOfMemoryError("none left")
@@ -220,7 +186,6 @@ def test_what_the_machine_refuses_is_no_fault_of_the_checkpoint(finished, monkey
 def test_a_plug_in_may_keep_what_is_infinite_in_a_buffer(config):
     """What may be saved may be read back: parameters alone have to be finite."""
     parts = assemble(config)
-    parts.backbone.transform = parts.attach.transform
     parts.backbone.register_buffer("best", torch.tensor(float("inf")))
     checkpoint = {"state_dict": parts.backbone.state_dict()}
     parts.backbone.on_save_checkpoint(checkpoint)

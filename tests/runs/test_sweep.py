@@ -39,7 +39,7 @@ def recorded(monkeypatch, tmp_path) -> list[dict]:
     monkeypatch.setattr(sweeper, "validate_batch_is_legal", lambda self, jobs: None)
     monkeypatch.setattr(allocator, "give_back", lambda: None)
 
-    def train(config, folder: Path, tell) -> dict:
+    def train(config, folder: Path, *_) -> dict:
         if config["loss"]["weight"] == 7:
             raise CTMError("on purpose")
         found.append(config)
@@ -300,7 +300,7 @@ def test_runs_in_one_process_leave_nothing_in_memory(ball, tmp_path, monkeypatch
 
 
 def test_a_bug_in_a_run_keeps_its_traceback(recorded, monkeypatch, capsys):
-    def train(config, folder, tell):
+    def train(config, folder, *_):
         raise RuntimeError("a bug")
 
     monkeypatch.setattr(training, "train", train)

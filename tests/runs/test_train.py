@@ -24,9 +24,9 @@ from ctm_plugin.data.blender import BlenderConfig
 from ctm_plugin.errors import CheckpointError, ConfigError
 from ctm_plugin.metrics.image import psnr
 from ctm_plugin.runs.assemble import assemble
-from ctm_plugin.runs.cameras import CAMERAS
+from ctm_plugin.runs.cameras import CAMERAS_FILE
 from ctm_plugin.runs.compose import conf_dir
-from ctm_plugin.runs.data import DATA
+from ctm_plugin.runs.data import DATA_FILE
 from ctm_plugin.runs.evaluate import evaluate
 from ctm_plugin.runs.provenance import code_version, versions
 from ctm_plugin.runs.rundir import CONFIG, LAST, METRICS, note_colors
@@ -64,7 +64,7 @@ def test_files(run):
     names = {str(path.relative_to(run)) for path in run.rglob("*") if path.is_file() and "tensorboard" not in str(path)}
     kinds = ("lit", "photo", "dark", "depth", "latent")
     pictures = {f"{kind}/r_{view}.png" for view in range(2) for kind in kinds}
-    assert names == {CONFIG, DATA, CAMERAS, METRICS, LAST} | pictures
+    assert names == {CONFIG, DATA_FILE, CAMERAS_FILE, METRICS, LAST} | pictures
     assert list((run / "tensorboard").glob("events.out.tfevents.*"))
 
 

@@ -9,7 +9,7 @@ from ctm_scenes.trajectory import hemisphere, look_at
 from scipy.interpolate import CubicHermiteSpline
 from scipy.spatial.transform import Rotation, Slerp
 
-from ctm_plugin.scene.camera_paths import KeyFrames, capture, focus, orbit, spiral, walk
+from ctm_plugin.scene.camera_paths import EASE, KeyFrames, capture, eased, focus, orbit, spiral, walk
 from ctm_plugin.scene.views import Views
 
 
@@ -98,19 +98,32 @@ def arc() -> np.ndarray:
     return np.stack([np.cross(up, back), up, back, 4 * back], 2)
 
 
-def test_the_film_stays_among_the_cameras_and_keeps_its_pace(arc):
+def test_the_film_stays_among_the_cameras_and_begins_and_ends_slowly(arc):
     poses = capture(views(arc), 40).double().numpy()
     eyes = poses[:, :, 3]
     assert (eyes >= arc[:, :, 3].min(0) - 1e-6).all()
     assert (eyes <= arc[:, :, 3].max(0) + 1e-6).all()
     steps = np.linalg.norm(np.diff(eyes, axis=0), axis=1)
-    assert steps.max() < 1.1 * steps.min()
+    middle = steps[7:-7]
+    assert middle.max() < 1.1 * middle.min()
+    assert max(steps[0], steps[-1]) < 0.2 * middle.min()
     assert steps.sum() > 0.5 * np.linalg.norm(np.diff(arc[:, :, 3], axis=0), axis=1).sum()
     np.testing.assert_allclose(
         poses[:, :, :3].transpose(0, 2, 1) @ poses[:, :, :3], np.tile(np.eye(3), (40, 1, 1)), atol=1e-6
     )
     # All cameras look at the origin, so the film does.
     assert ((eyes / np.linalg.norm(eyes, axis=1, keepdims=True) * poses[:, :, 2]).sum(1) > 0.99).all()
+
+
+def test_a_film_is_eased():
+    """The speed is a trapezoid of area 1: symmetric, even between the ramps, and half of that half way up them."""
+    times = np.linspace(0, 1, 1001)
+    along = eased(times)
+    np.testing.assert_allclose(along + along[::-1], 1, atol=1e-12)
+    speed = np.gradient(along, times)
+    np.testing.assert_allclose(speed[200:800], 1 / (1 - EASE), rtol=1e-9)
+    np.testing.assert_allclose(np.interp(EASE / 2, times, speed), 0.5 / (1 - EASE), rtol=1e-2)
+    assert speed[0] < 0.01
 
 
 def test_names_in_no_order_make_the_same_film(arc):

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from ctm_plugin.runs.compose import compose
 from ctm_plugin.settings import registry
-from ctm_plugin.settings.as_typed import LEFT, as_typed, bare
+from ctm_plugin.settings.as_typed import HYDRA_VALUES, as_typed, bare
 
 NAMES = (
     """20240501|2024_05_01|große Aufnahme|カメラ|cap (1)|a&b|a#b|it's|a=b|true|1e5|0x10|nan|[x]|{y}|x"y|a\\b|b\\| sp"""
@@ -38,7 +38,9 @@ def test_a_name_is_one_text(name, key, sweep):
     assert as_typed(quoted, sweep) == quoted
 
 
-@given(st.text(min_size=1).filter(lambda text: "," not in text and "\n" not in text and not LEFT.fullmatch(text)))
+@given(
+    st.text(min_size=1).filter(lambda text: "," not in text and "\n" not in text and not HYDRA_VALUES.fullmatch(text))
+)
 def test_any_text(text):
     assert values(as_typed(f"dataset.root={text}", False)) == [text]
 

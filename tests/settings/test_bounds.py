@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from ctm_plugin.appearance.settings import AffineConfig, BilateralConfig, ExposureConfig
+from ctm_plugin.appearance.settings import ExposureConfig
 from ctm_plugin.backbones.settings import BARF2DConfig, NeRFConfig, NGPConfig, SplatConfig
 from ctm_plugin.color.photometric import Photometric
 from ctm_plugin.color.settings import LightConfig, TransformTraining
@@ -81,11 +81,6 @@ TABLE = {
         (ExposureConfig, "one of same, light, exif", {"start": "bright"}),
         (ExposureConfig, "a number > 0", {"lr": 0.0}),
         (ExposureConfig, "a number in (0, 1]", {"lr_decay": 2.0}),
-        (AffineConfig, "a number > 0", {"lr_colors": -1.0}),
-        (AffineConfig, "a number >= 0", {"identity": -1.0}),
-        (BilateralConfig, "an integer, 2 to 256", {"across": 1, "levels": 1}),
-        (BilateralConfig, "a number >= 0", {"smooth": -1.0}),
-        (BilateralConfig, "a number > 0", {"lr_grid": 0.0}),
     ],
 }
 """By section: a dataclass, what a key may be, and values that it may not; a list has several."""

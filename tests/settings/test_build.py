@@ -66,6 +66,13 @@ def test_settings_say_what_they_mean_and_what_a_command_line_has():
     }  # fmt: skip
 
 
+def test_values_by_budget():
+    text = "${by_budget:${by_geometry:1,2},[3,4]}"
+    for budget, expected in {"quick": 2, "auto": 2, "standard": [3, 4]}.items():
+        node = OmegaConf.create({"trainer": {"budget": budget}, "a": {"geometry": "forward", "b": text}})
+        assert node.a.b == expected
+
+
 def test_values_by_geometry():
     found = {}
     for geometry in (None, "bounded", "forward", "unbounded"):

@@ -12,9 +12,12 @@ import pytest
 from ctm_plugin.appearance.exposure import Exposure
 from ctm_plugin.backbones.base import Backbone
 from ctm_plugin.color.transform import ColorTransform
-from ctm_plugin.errors import CTMError, UnknownNameError
+from ctm_plugin.errors import ConfigError, CTMError, UnknownNameError
 from ctm_plugin.loggers.base import RunLogger
+from ctm_plugin.runs.assemble import color_transform, load_scene
+from ctm_plugin.runs.compose import compose, conf_dir
 from ctm_plugin.settings import registry
+from ctm_plugin.settings.listing import choices
 from ctm_plugin.settings.registry import REGISTRIES, Registry
 
 GROUP = "ctm_plugin.shapes"
@@ -103,6 +106,62 @@ def test_settings_of_ours_are_found_without_the_class(tmp_path, monkeypatch):
     assert spaces.settings("one").__name__ == "OneConfig"
     assert "space_of_one" not in sys.modules
     assert spaces.settings("two") is spaces.get("two").Config
+
+
+THEIRS = """
+from dataclasses import dataclass
+
+from ctm_plugin.color.transform import ColorTransform
+from ctm_plugin.data.load import Layout
+from ctm_plugin.data.settings import BoundsConfig
+from ctm_plugin.settings.setting import Settings, setting
+
+
+@dataclass(frozen=True)
+class HalvedConfig(Settings, section="ctm"):
+    times: int = setting(1, "how often", least=1)
+
+
+class Halved(ColorTransform):
+    "Half of each colour."
+
+    Config = HalvedConfig
+
+
+@dataclass(frozen=True, kw_only=True)
+class Album(Layout, BoundsConfig):
+    layout = "album"
+    pages: int = setting(3, "pages", least=1)
+
+    def load(self, capture=None):
+        return self
+"""
+
+
+@pytest.fixture
+def added(tmp_path, monkeypatch):
+    """A transform and a data set, a file and a line of a table each; gone again afterwards."""
+    (tmp_path / "in_one_file.py").write_text(THEIRS)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setitem(registry.TRANSFORMS.ours, "halved", "in_one_file:Halved")
+    monkeypatch.setitem(registry.DATASETS.ours, "album", "in_one_file:Album")
+
+
+def test_a_file_and_a_line_add_a_transform_and_a_data_set(added, tmp_path):
+    data = ("dataset=album", f"dataset.root={tmp_path}", "dataset.geometry=bounded", "trainer=smoke")
+    config = compose("ctm=halved", "ctm.times=2", *data)
+    assert (config["ctm"]["preset"], config["ctm"]["times"], config["dataset"]["pages"]) == ("halved", 2, 3)
+    transform, _ = color_transform(config, 0)
+    assert (type(transform).__name__, transform.config.times) == ("Halved", 2)
+    assert load_scene(config).pages == 3
+    assert choices(conf_dir(), "ctm")["halved"] == "Half of each colour"
+    with pytest.raises(ConfigError, match=r"dataset\.pages: found 0, expected an integer >= 1"):
+        load_scene(compose(*data, "dataset.pages=0"))
+
+
+def test_what_was_removed_is_no_choice():
+    with pytest.raises(ConfigError, match="ctm: found 'halved', expected one of auto, off, on, quick, release"):
+        compose("ctm=halved")
 
 
 BASES = {

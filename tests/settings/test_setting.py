@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ctm_plugin.errors import ConfigError
-from ctm_plugin.settings.registry import REGISTRIES, SETTINGS, load
-from ctm_plugin.settings.setting import MOST, Settings, meanings, rules, setting
+from ctm_plugin.settings.registry import PRESET_SETTINGS, REGISTRIES, load
+from ctm_plugin.settings.setting import MAX_INT, Settings, meanings, rules, setting
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,7 +37,7 @@ class Special(Thing):
         ("count", True, "an integer, 0 to 5"),
         ("count", None, "an integer, 0 to 5"),
         ("many", 0, "an integer >= 1 or null"),
-        ("many", MOST + 1, "an integer >= 1 or null"),
+        ("many", MAX_INT + 1, "an integer >= 1 or null"),
         ("share", 0, "a number in (0, 1]"),
         ("share", math.nan, "a number in (0, 1]"),
         ("share", "1", "a number in (0, 1]"),
@@ -56,7 +56,7 @@ def test_what_is_refused(key, value, expected):
 
 
 @pytest.mark.parametrize(
-    "taken", [{"count": 5}, {"many": None}, {"many": MOST}, {"share": 1}, {"level": "scene"}, {"either": False}]
+    "taken", [{"count": 5}, {"many": None}, {"many": MAX_INT}, {"share": 1}, {"level": "scene"}, {"either": False}]
 )
 def test_what_is_taken(taken):
     assert vars(Thing(**taken)) == vars(Thing()) | taken
@@ -81,7 +81,7 @@ def test_a_rule_that_is_misspelt():
 
 
 def test_every_number_of_ours_has_a_range():
-    kinds = [load(entry) for entry in SETTINGS.values()]
+    kinds = [load(entry) for entry in PRESET_SETTINGS.values()]
     kinds += [registry.settings(name) for registry in REGISTRIES.values() for name in registry.ours]
     bare = {
         f"{kind.__name__}.{name}"

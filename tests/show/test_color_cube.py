@@ -8,7 +8,7 @@ from ctm_plugin.color.settings import CTMConfig
 from ctm_plugin.color.spaces.rgb import Space as RGB
 from ctm_plugin.color.transform import ColorTransform
 from ctm_plugin.draws import seeded
-from ctm_plugin.show.color_cube import DOT, SIDE, cube_picture, dots
+from ctm_plugin.show.color_cube import DOT_RADIUS, PICTURE_SIDE, cube_picture, dots
 
 
 class Shrunk(ColorTransform):
@@ -19,7 +19,11 @@ class Shrunk(ColorTransform):
 
 
 def quarters(picture: torch.Tensor) -> list[torch.Tensor]:
-    return [picture[y : y + SIDE, x : x + SIDE] for y in (0, SIDE + 2) for x in (0, SIDE + 2)]
+    return [
+        picture[y : y + PICTURE_SIDE, x : x + PICTURE_SIDE]
+        for y in (0, PICTURE_SIDE + 2)
+        for x in (0, PICTURE_SIDE + 2)
+    ]
 
 
 def coloured(picture: torch.Tensor) -> torch.Tensor:
@@ -52,7 +56,7 @@ def test_any_number_of_channels():
     for k in (1, 2, 3, 5):
         with seeded(0):
             picture = cube_picture(CTM(CTMConfig(k=k, width=8)), torch.rand(50, 3))
-        assert picture.shape == (2 * SIDE + 2, 2 * SIDE + 2, 3)
+        assert picture.shape == (2 * PICTURE_SIDE + 2, 2 * PICTURE_SIDE + 2, 3)
         assert picture.isfinite().all()
 
 
@@ -62,7 +66,7 @@ def test_nearer_dots_are_in_front():
     near = near + 0.3 * torch.tensor([0.8214, 0.3830, 0.4226])
     for order in ((0, 1), (1, 0)):
         places, colors = torch.stack([away, near])[list(order)], torch.eye(3)[:2][list(order)]
-        middle = dots(places, colors)[SIDE // 2, SIDE // 2]
+        middle = dots(places, colors)[PICTURE_SIDE // 2, PICTURE_SIDE // 2]
         assert middle.tolist() == [0, 1, 0]
 
 
@@ -70,4 +74,4 @@ def test_every_corner_is_in_the_picture():
     corners = torch.cartesian_prod(*3 * [torch.tensor([0.0, 1.0])])
     for corner in corners:
         picture = dots(corner[None], torch.tensor([[1.0, 0, 0]]))
-        assert int(coloured(picture).sum()) >= (2 * DOT) ** 2
+        assert int(coloured(picture).sum()) >= (2 * DOT_RADIUS) ** 2

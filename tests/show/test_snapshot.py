@@ -8,7 +8,7 @@ from faults import checkpoint, differing, scores
 from torch import nn
 
 from ctm_plugin.backbones.radiance import RadianceBackbone, RayRendering
-from ctm_plugin.callbacks.dashboard import snapshot
+from ctm_plugin.backbones.untouched import snapshot
 from ctm_plugin.color.light import brighten
 from ctm_plugin.metrics.image import psnr
 from ctm_plugin.runs.assemble import Parts, assemble
@@ -35,11 +35,11 @@ class Careless(RadianceBackbone):
 
     Config = CarelessConfig
 
-    def __init__(self, config, scene, channels=3, photometric=None, seed=0):
-        super().__init__(scene, 32, channels, photometric, seed)
+    def __init__(self, config, scene, transform=None, photometric=None, seed=0):
+        super().__init__(scene, 32, transform, photometric, seed)
         self.total_steps = config.steps
         torch.manual_seed(seed)
-        self.net = nn.Sequential(nn.Linear(3, 8), nn.BatchNorm1d(8), nn.Dropout(0.5), nn.Linear(8, channels))
+        self.net = nn.Sequential(nn.Linear(3, 8), nn.BatchNorm1d(8), nn.Dropout(0.5), nn.Linear(8, self.channels))
 
     def render(self, rays, background, draws):
         noise = 0.1 * torch.rand(len(rays.origins), 3)
@@ -77,16 +77,14 @@ def test_modes_and_random_states_stay(compose, monkeypatch):
     assert set(modes) == {True, False}
     states = {name: value.clone() for name, value in module.state_dict().items()}
     before = torch.get_rng_state()
-    snapshot(module)
+    snapshot(module, 0)
     assert [part.training for part in module.modules()] == modes
     assert torch.equal(torch.get_rng_state(), before)
     assert list(differing(dict(module.state_dict()), states)) == []
 
 
 def parts(compose, *arguments: str) -> Parts:
-    made = assemble(compose(*arguments))
-    made.attach.attach(made.backbone)
-    return made
+    return assemble(compose(*arguments))
 
 
 def names(seen: Snapshot) -> set[str]:
@@ -96,7 +94,7 @@ def names(seen: Snapshot) -> set[str]:
 @pytest.mark.parametrize("k", [1, 3, 5])
 def test_a_view(compose, k):
     made = parts(compose, *DVGO, f"ctm.k={k}", "dataset.exposure=0.1")
-    seen, views = snapshot(made.backbone), made.scene.test
+    seen, views = snapshot(made.backbone, 0), made.scene.test
     assert names(seen) == {"render", "target", "error", "latent", "depth", "lit", "cube"}
     target = composite(views.images[0], made.backbone.constant_background())
     assert torch.equal(seen.pictures["test/target"], target)
@@ -110,9 +108,9 @@ def test_a_view(compose, k):
     assert 5 < light.gain < 40
     assert torch.equal(left, light.apply(view["rgb"]))
     assert torch.equal(right, light.apply(target))
-    assert seen.scores["psnr/test_view"] == float(psnr(view["rgb"][None], target[None]))
+    assert seen.scores["psnr"] == float(psnr(view["rgb"][None], target[None]))
     brightened = float(psnr(brighten(view["rgb"], 10.0, "hard"), brighten(target, 10.0, "hard")))
-    assert seen.scores["psnr/test_view_brightened"] == pytest.approx(brightened)
+    assert seen.scores["psnr_enhanced"] == pytest.approx(brightened)
 
 
 def test_a_view_without_a_picture(compose):
@@ -120,9 +118,11 @@ def test_a_view_without_a_picture(compose):
     module, count = made.backbone, len(made.scene.test)
     some = torch.arange(count) == 1
     module.scene = replace(made.scene, test=replace(made.scene.test, pictured=some))
-    assert torch.equal(snapshot(module).pictures["test/target"], module.targets()[1])
+    assert module.snapshots == [1]
+    assert torch.equal(snapshot(module, 1).pictures["test/target"], module.target(1))
     module.scene = replace(made.scene, test=replace(made.scene.test, pictured=some & False))
-    seen = snapshot(module)
+    assert module.snapshots == [0]
+    seen = snapshot(module, 0)
     assert names(seen) == {"render", "latent", "depth", "lit", "cube"}
     assert seen.pictures["test/lit"].shape == seen.pictures["test/render"].shape
     assert seen.scores == {}
@@ -137,29 +137,29 @@ def test_one_ray_a_pixel_does(compose, monkeypatch):
         return own(rays, background, draws)
 
     monkeypatch.setattr(module, "render", render)
-    snapshot(module)
+    snapshot(module, 0)
     assert set(drawn) == {None}
     module.eval().render_view(module.scene.test, 0)
     assert set(drawn) > {None}
 
 
 def test_large_views_are_thinned_out(compose, monkeypatch):
-    monkeypatch.setattr("ctm_plugin.backbones.base.WIDTH", 5)
+    monkeypatch.setattr("ctm_plugin.backbones.base.PREVIEW_WIDTH", 5)
     made = parts(compose, *DVGO)
-    seen = snapshot(made.backbone)
+    seen = snapshot(made.backbone, 0)
     made.backbone.eval()
     whole = made.backbone.render_view(made.scene.test, 0)["rgb"]
     assert seen.pictures["test/render"].shape == (4, 4, 3)
     torch.testing.assert_close(seen.pictures["test/render"], whole[::3, ::3])  # the very same pixels
-    monkeypatch.setattr("ctm_plugin.backbones.base.WIDTH", 128)
+    monkeypatch.setattr("ctm_plugin.backbones.base.PREVIEW_WIDTH", 128)
     made.backbone.batch_rays = 4  # of 144 pixels no more than 8 steps have rays
-    assert snapshot(made.backbone).pictures["test/render"].shape == (4, 4, 3)
+    assert snapshot(made.backbone, 0).pictures["test/render"].shape == (4, 4, 3)
 
 
 def test_a_picture_under_alignment(compose, monkeypatch):
-    monkeypatch.setattr("ctm_plugin.backbones.base.WIDTH", 25)
+    monkeypatch.setattr("ctm_plugin.backbones.base.PREVIEW_WIDTH", 25)
     made = parts(compose, *PLANAR, "dataset.exposure=0.1")
-    seen = snapshot(made.backbone)
+    seen = snapshot(made.backbone, 0)
     assert names(seen) == {"render", "target", "error", "latent", "warps", "lit", "cube"}
     assert torch.equal(seen.pictures["test/target"], made.scene.image[::2, ::2])
     assert seen.pictures["test/render"].shape == (20, 25, 3)
@@ -169,7 +169,7 @@ def test_a_picture_under_alignment(compose, monkeypatch):
 def test_another_kind_shows_its_colours(compose):
     from callbacks.toy import Toy
 
-    seen = snapshot(Toy(3))
+    seen = snapshot(Toy(3), 0)
     assert seen.pictures.keys() == {"colors/cube"}
     assert seen.latents.keys() == {"latent/scene"}
     assert seen.scores == {}

@@ -6,10 +6,10 @@ import pytest
 import torch
 
 from ctm_plugin.splats.gaussians import Gaussians, rotations
-from ctm_plugin.splats.growth import LARGE, SHRUNK, Change, densify, shows
+from ctm_plugin.splats.growth import GROW_SCALE3D, SPLIT_FACTOR, Change, densify, shows
 
 EXTENT = 5.0
-SMALL, WIDE = math.log(0.5 * LARGE * EXTENT), math.log(2.0 * LARGE * EXTENT)
+SMALL, WIDE = math.log(0.5 * GROW_SCALE3D * EXTENT), math.log(2.0 * GROW_SCALE3D * EXTENT)
 
 
 def some(count: int = 6, size: float = SMALL) -> Gaussians:
@@ -46,12 +46,12 @@ def test_large_ones_are_split():
     assert change.kept.tolist() == [0, 2, 3, 5]
     halves = change.added
     assert len(halves.means) == 4
-    for name in ("turns", "opacities", "base", "rest"):
+    for name in ("quats", "opacities", "sh0", "shN"):
         assert torch.equal(getattr(halves, name), getattr(gaussians, name)[[1, 4, 1, 4]])
-    torch.testing.assert_close(halves.scales, gaussians.scales[[1, 4, 1, 4]] - math.log(SHRUNK))
+    torch.testing.assert_close(halves.scales, gaussians.scales[[1, 4, 1, 4]] - math.log(SPLIT_FACTOR))
     for row, (each, part) in enumerate(((1, 0), (4, 0), (1, 1), (4, 1))):
         away = normal[each].view(2, 3)[part] * gaussians.scales[each].exp()
-        expected = gaussians.means[each] + rotations(gaussians.turns)[each] @ away
+        expected = gaussians.means[each] + rotations(gaussians.quats)[each] @ away
         torch.testing.assert_close(halves.means[row], expected)
 
 
@@ -61,7 +61,7 @@ def test_what_goes_has_no_twin_and_no_halves():
     gaussians.opacities[[1, 4]] = -9.0
     change = grown(gaussians, [2, 2, 0, 0, 2, 0])
     assert change.kept.tolist() == [0, 2, 3, 5]
-    assert torch.equal(change.added.base, gaussians.base[[0]])
+    assert torch.equal(change.added.sh0, gaussians.sh0[[0]])
 
 
 @pytest.mark.parametrize("field", Gaussians._fields)
@@ -83,7 +83,7 @@ def test_what_is_no_number_goes(field, value):
 def test_a_cap_takes_those_pulled_at_hardest(most, which):
     gaussians = some()
     change = grown(gaussians, [2, 4, 0.5, 3, 5, 1], most=most)
-    assert torch.equal(change.added.base, gaussians.base[which])
+    assert torch.equal(change.added.sh0, gaussians.sh0[which])
     assert len(change.kept) == 6
 
 

@@ -12,8 +12,8 @@ from ctm_plugin.rays.spherical_harmonics import harmonics
 from ctm_plugin.scene.frustum import projected as seen_by
 from ctm_plugin.scene.views import Views
 from ctm_plugin.splats.gaussians import (
-    AROUND,
-    BLUR,
+    EPS2D,
+    FRAME_MARGINS,
     Camera,
     Gaussians,
     camera_of,
@@ -22,14 +22,14 @@ from ctm_plugin.splats.gaussians import (
     rotations,
     secants,
 )
-from ctm_plugin.splats.render import PLANE, expected_depth, picture
+from ctm_plugin.splats.render import PLANE_CHANNELS, expected_depth, picture
 
 DOUBLE = torch.float64
 
 
 def one(mean: tuple[float, ...], size: tuple[float, ...], opacity: float, turn=(1.0, 0.0, 0.0, 0.0)) -> Gaussians:
     """One Gaussian of mid grey, in float64."""
-    table = {"means": mean, "scales": size, "turns": turn, "opacities": (opacity,), "base": (0.0,), "rest": ()}
+    table = {"means": mean, "scales": size, "quats": turn, "opacities": (opacity,), "sh0": (0.0,), "shN": ()}
     return Gaussians(*(torch.tensor([each], dtype=DOUBLE) for each in table.values()))
 
 
@@ -71,7 +71,7 @@ def test_nothing_to_see():
     close, faint = one((0.0, 0.0, -0.9 * NEAR), (0.0,) * 3, 9.0), one((0.0, 0.0, -2.0), (0.0,) * 3, -6.0)
     for gaussians in (none, behind, close, faint):
         for run in (picture.reference, picture):
-            image, left = run(gaussians, camera, no_shift(gaussians), 1, FLOOR, PLANE)
+            image, left = run(gaussians, camera, no_shift(gaussians), 1, FLOOR, PLANE_CHANNELS)
             assert not image.any()
             assert (left == 1).all()
 
@@ -135,13 +135,13 @@ def test_covariances_are_those_of_the_lens_local_map(lens):
         at = torch.stack(distort(x / z, y / z, camera.distortion))
         return camera.lens[:2] * at + camera.lens[2:]
 
-    found, turns = of.projected(), rotations(tables.turns)
+    found, turns = of.projected(), rotations(tables.quats)
     for each in range(30):
         local = camera.turn @ (tables.means[each] - camera.centre)
         assert (local[:2].abs() / local[2] < camera.reach).all()
         jacobian = torch.autograd.functional.jacobian(imaged, tables.means[each])
         spread = turns[each] @ tables.scales[each].exp().diag()
-        expected = jacobian @ spread @ spread.T @ jacobian.T + BLUR * torch.eye(2, dtype=DOUBLE)
+        expected = jacobian @ spread @ spread.T @ jacobian.T + EPS2D * torch.eye(2, dtype=DOUBLE)
         a, b, c = found.conics[each]
         conic = torch.stack([torch.stack([a, b]), torch.stack([b, c])])
         torch.testing.assert_close(conic.inverse(), expected)
@@ -172,7 +172,7 @@ def test_far_outside_of_the_frame_the_projection_is_straight(lens):
     assert (right.diff() > 0).all()
     assert (right[2:] - right[1:2] > camera.width / 8).all()
     torch.testing.assert_close((right[3] - right[1]) / (right[2] - right[1]), torch.tensor(2.0, dtype=DOUBLE))
-    assert camera.reach[0].item() > (camera.width / 2) / camera.lens[0].item() * AROUND[lens] * 0.99
+    assert camera.reach[0].item() > (camera.width / 2) / camera.lens[0].item() * FRAME_MARGINS[lens] * 0.99
 
 
 @pytest.mark.parametrize("degrees", [1, 2, 3, 4])
@@ -181,7 +181,7 @@ def test_colors_are_harmonics_of_the_direction(degrees):
     gaussians, centre = of.gaussians, of.camera.centre
     found = colors_seen(gaussians, centre, degrees, -9.0)
     basis = harmonics(torch.nn.functional.normalize(gaussians.means - centre, dim=1), degrees)
-    every = torch.cat([gaussians.base[:, None], gaussians.rest.view(20, 15, 2)], 1)[:, : degrees**2]
+    every = torch.cat([gaussians.sh0[:, None], gaussians.shN.view(20, 15, 2)], 1)[:, : degrees**2]
     torch.testing.assert_close(found, 0.5 + (basis[..., None] * every).sum(1))
     torch.testing.assert_close(colors_seen(gaussians, centre, degrees, 0.4), found.clamp_min(0.4))
 
@@ -208,12 +208,12 @@ def test_a_wall_is_as_far_as_its_plane(angle, lens):
     camera, views = straight(distortion=lens)
     turn = (math.cos(angle / 2), 0.0, math.sin(angle / 2), 0.0)  # round y
     wall = one((0.1, -0.1, -4.0), (0.5, 0.5, -7.0), 9.0, turn)
-    image, left = picture.reference(wall, camera, no_shift(wall), 1, FLOOR, PLANE)
+    image, left = picture.reference(wall, camera, no_shift(wall), 1, FLOOR, PLANE_CHANNELS)
     narrow = camera_of(views, 0, NEAR)
     depth = expected_depth(image.float(), left.float(), narrow, 50.0)
     depth = (depth - 50 * left) / (1 - left)
     rays = pixel_rays(views.c2w, views.intrinsics, 25, 31, torch.arange(31 * 25), views.distortion)
-    normal = rotations(wall.turns)[0, :, 2].float()
+    normal = rotations(wall.quats)[0, :, 2].float()
     expected = ((wall.means[0].float() @ normal) / (rays.directions @ normal)).view(25, 31)
     middle = torch.zeros(25, 31, dtype=torch.bool)
     middle[8:18, 11:22] = True

@@ -8,9 +8,9 @@ from gaussian_scenes import LENS, views_of
 
 from ctm_plugin.rays.cameras import pixel_rays
 from ctm_plugin.scene.views import Views
-from ctm_plugin.splats.scales import LONGER, OCTAVES, SIDES, SMALLEST, averaged, stages
+from ctm_plugin.splats.scales import MIN_SIDE, OCTAVES, SIDES, STAGE_POWER, averaged, stages
 
-SIDE = SIDES[0] * SMALLEST
+SIDE = SIDES[0] * MIN_SIDE
 
 
 def views_with(images: torch.Tensor, mask: torch.Tensor | None = None) -> Views:
@@ -30,13 +30,13 @@ def test_of_noise_each_octave_has_a_quarter_of_the_next():
     """Means over squares of s pixels have 1 / s of its deviation, and frequencies are weighed by 1 / s again."""
     found = stages(views_with(uniform(2, SIDE, SIDE, 3)))
     quarters = torch.tensor(0.25) ** torch.arange(OCTAVES)
-    expected = {side: float(quarters[at:].sum() / quarters.sum()) ** LONGER for side, at in ((4, 2), (2, 1))}
+    expected = {side: float(quarters[at:].sum() / quarters.sum()) ** STAGE_POWER for side, at in ((4, 2), (2, 1))}
     assert {stage.side: stage.until for stage in found} == pytest.approx(expected, rel=0.02)
 
 
 def test_of_a_slope_each_octave_has_as_much():
     slope = torch.linspace(0, 1, SIDE)[None, :, None].expand(1, SIDE, SIDE, 3).contiguous()
-    expected = {4: (3 / 5) ** LONGER, 2: (4 / 5) ** LONGER}
+    expected = {4: (3 / 5) ** STAGE_POWER, 2: (4 / 5) ** STAGE_POWER}
     assert {stage.side: stage.until for stage in stages(views_with(slope.transpose(1, 2)))} == pytest.approx(expected)
 
 
@@ -50,7 +50,7 @@ def test_smaller_pictures_come_first_and_the_exposure_changes_nothing():
 
 
 def test_where_there_is_nothing_to_learn_from_smaller_ones():
-    assert stages(views_with(uniform(2, 2 * SMALLEST - 1, SIDE, 3))) == []
+    assert stages(views_with(uniform(2, 2 * MIN_SIDE - 1, SIDE, 3))) == []
     assert [stage.side for stage in stages(views_with(uniform(2, SIDE - 1, SIDE, 3)))] == [2]
     assert all(stage.until == 0 for stage in stages(views_with(torch.full((1, SIDE, SIDE, 3), 0.5))))
 

@@ -14,12 +14,12 @@ from ctm_plugin.splats.seen import as_wide_as_pixels, pixels_made, times_seen
 def test_pixels_made_are_what_a_gaussian_s_own_colour_adds():
     """White before black, one by one; all together make what the light does not pass."""
     of = setting(12, channels=1, degrees=1, width=20, height=16)
-    camera, black = of.camera, of.gaussians._replace(base=torch.full((12, 1), -1e3), rest=torch.zeros(12, 0))
+    camera, black = of.camera, of.gaussians._replace(sh0=torch.full((12, 1), -1e3), shN=torch.zeros(12, 0))
     shift, found = torch.zeros(12, 2), pixels_made(of.gaussians, [camera, camera])
     for index in range(12):
-        one = black.base.clone()
+        one = black.sh0.clone()
         one[index] = 0.5 / 0.28209479177387814  # white
-        shown = picture(black._replace(base=one), camera, shift, 1, 0.0, 0)[0].sum()
+        shown = picture(black._replace(sh0=one), camera, shift, 1, 0.0, 0)[0].sum()
         assert found[index] == pytest.approx(float(shown), rel=1e-3, abs=1e-3)
     left = picture(black, camera, shift, 1, 0.0, 0)[1]
     assert found.sum() == pytest.approx(float((1 - left).sum()), rel=1e-3)

@@ -12,7 +12,7 @@ from ctm_plugin.data.blender import BlenderConfig
 from ctm_plugin.scene.frustum import projected, view_counts
 from ctm_plugin.scene.views import Points, Scene
 from ctm_plugin.splats.gaussians import colors_seen
-from ctm_plugin.splats.start import FEW, OPACITY, colors_of, first_gaussians, first_places, random_places
+from ctm_plugin.splats.start import MIN_POINTS, START_OPACITY, colors_of, first_gaussians, first_places, random_places
 
 HIGH, WIDE = 8, 10
 
@@ -43,19 +43,21 @@ def with_points(scene: Scene, positions: Tensor, tracks: list[tuple[int, int]] =
 
 
 def test_enough_points_are_all_there_is(row):
-    positions = torch.randn(FEW, 3, generator=torch.Generator().manual_seed(0)) - torch.tensor([0.0, 0.0, 5.0])
+    positions = torch.randn(MIN_POINTS, 3, generator=torch.Generator().manual_seed(0)) - torch.tensor([0.0, 0.0, 5.0])
     places, colors = first_places(with_points(row, positions), 1000, 0)
     assert torch.equal(places, positions)
-    assert colors.shape == (FEW, 3)
+    assert colors.shape == (MIN_POINTS, 3)
 
 
 def test_few_points_have_random_ones_beside_them(row):
-    positions = torch.randn(FEW - 1, 3, generator=torch.Generator().manual_seed(0)) - torch.tensor([0.0, 0.0, 5.0])
+    positions = torch.randn(MIN_POINTS - 1, 3, generator=torch.Generator().manual_seed(0)) - torch.tensor(
+        [0.0, 0.0, 5.0]
+    )
     places, _ = first_places(with_points(row, positions), 40, 0)
-    assert torch.equal(places[: FEW - 1], positions)
-    assert torch.equal(places[FEW - 1 :], random_places(row, 40, 0))
-    assert len(places) == FEW - 1 + 40
-    assert torch.equal(first_places(row, 40, 0)[0], places[FEW - 1 :])
+    assert torch.equal(places[: MIN_POINTS - 1], positions)
+    assert torch.equal(places[MIN_POINTS - 1 :], random_places(row, 40, 0))
+    assert len(places) == MIN_POINTS - 1 + 40
+    assert torch.equal(first_places(row, 40, 0)[0], places[MIN_POINTS - 1 :])
 
 
 @pytest.mark.parametrize("geometry", ["bounded", "unbounded"])
@@ -115,7 +117,7 @@ def test_colours_are_of_the_pictures_that_see_a_point(row):
     # The third has no track: all five have it in their frame. The fourth's last one does not.
     expected = torch.tensor([(0.2 + 0.4) / 2, 0.5, 0.3, 0.1, 0.5])
     torch.testing.assert_close(found, expected[:, None].expand(5, 3))
-    many = torch.cat([positions, torch.tensor([[0.0, 0.0, -10.0]]).repeat(FEW, 1)])
+    many = torch.cat([positions, torch.tensor([[0.0, 0.0, -10.0]]).repeat(MIN_POINTS, 1)])
     torch.testing.assert_close(first_places(with_points(row, many, tracks), 10, 0)[1][:5], found)
 
 
@@ -161,8 +163,8 @@ def test_the_first_gaussians(degree):
     assert found.scales[0, 0].exp().item() == pytest.approx(math.sqrt((1 + 4 + 9) / 3))
     assert found.scales[1, 2].exp().item() == pytest.approx(math.sqrt((1 + 5 + 10) / 3))
     assert (found.scales == found.scales[:, :1]).all()
-    assert found.opacities.sigmoid().flatten().tolist() == pytest.approx([OPACITY] * 5)
-    assert found.rest.shape == (5, 2 * ((degree + 1) ** 2 - 1))
+    assert found.opacities.sigmoid().flatten().tolist() == pytest.approx([START_OPACITY] * 5)
+    assert found.shN.shape == (5, 2 * ((degree + 1) ** 2 - 1))
     seen = colors_seen(found, torch.tensor([0.3, 0.4, 7.0]), degree + 1, 0.0)
     torch.testing.assert_close(seen, colors)
 

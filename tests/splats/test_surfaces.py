@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from ctm_plugin.splats.render import EDGE, SEEN, STRIDES, bends
+from ctm_plugin.splats.render import EDGE_WIDTH, MIN_OPACITY, STRIDES, bends
 
 HIGH, WIDE = 12, 20
 FULL = torch.ones(HIGH, WIDE)
@@ -36,7 +36,7 @@ def test_edges_of_the_picture_may_bend():
     colors = torch.where((X > 9)[..., None], 0.8, 0.2) * torch.ones(3)
     step = torch.where(X > 9, 0.5, 0.2)
     assert bends(step, FULL, colors) < 1e-6 < bends(step, FULL, GREY)
-    softer = torch.where((X > 9)[..., None], 0.5 + EDGE, 0.5) * torch.ones(3)
+    softer = torch.where((X > 9)[..., None], 0.5 + EDGE_WIDTH, 0.5) * torch.ones(3)
     found = bends(step, FULL, softer) / bends(step, FULL, GREY)
     assert found.item() == pytest.approx(math.exp(-1), rel=1e-4)
 
@@ -51,7 +51,7 @@ def test_gradients_are_of_the_depth_alone():
 def test_where_next_to_nothing_is_nothing_blows_up():
     inverse = 1e-3 * torch.rand(HIGH, WIDE, generator=torch.Generator().manual_seed(0))
     found = bends(inverse, torch.zeros(HIGH, WIDE), GREY)
-    assert found < 4e-3 / SEEN * WIDE * 2
+    assert found < 4e-3 / MIN_OPACITY * WIDE * 2
 
 
 @pytest.mark.parametrize(("height", "width"), [(1, 1), (2, 9), (9, 2)])

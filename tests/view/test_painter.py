@@ -8,10 +8,20 @@ import pytest
 import torch
 
 from ctm_plugin.color.light import Light
-from ctm_plugin.view.camera import Camera
-from ctm_plugin.view.painter import AT_ONCE, COARSEST, GUESS, WORTH, Limit, Look, Painter, Renderings, Shot
+from ctm_plugin.view.camera import BrowserCamera
+from ctm_plugin.view.painter import (
+    ASSUMED_SPEED,
+    FIRST_SECONDS,
+    MIN_GROWTH,
+    MIN_SIDE,
+    Limit,
+    Look,
+    Painter,
+    Renderings,
+    Viewpoint,
+)
 
-SHOT = Shot(Camera((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 1.0, 2.0))
+SHOT = Viewpoint(BrowserCamera((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 1.0, 2.0))
 
 
 class Flat:
@@ -138,11 +148,11 @@ def test_how_coarse_and_how_fine_follow_from_speed_and_limit(speed, limit):
     studio.ask(0, "b", limit)
     studio.work()
     first, last = sizes(studio)[0], sizes(studio)[-1]
-    assert first == COARSEST or first**2 / speed <= AT_ONCE
-    assert 2 * first > limit.finest or (2 * first) ** 2 / speed > AT_ONCE
+    assert first == MIN_SIDE or first**2 / speed <= FIRST_SECONDS
+    assert 2 * first > limit.finest or (2 * first) ** 2 / speed > FIRST_SECONDS
     assert last <= limit.finest
-    assert last == COARSEST or last**2 / speed <= limit.seconds
-    assert last == limit.finest or (WORTH * last + 1) ** 2 / speed > limit.seconds
+    assert last == MIN_SIDE or last**2 / speed <= limit.seconds
+    assert last == limit.finest or (MIN_GROWTH * last + 1) ** 2 / speed > limit.seconds
 
 
 def test_other_limits_go_on_from_what_is_shown():
@@ -170,7 +180,7 @@ def test_moving_stops_a_finer_picture():
 
 def test_a_first_picture_is_shown_though_the_client_moved_on():
     """Else a client who keeps moving would see nothing."""
-    studio = Studio(GUESS)
+    studio = Studio(ASSUMED_SPEED)
     for before, after in pairwise("abcdef"):
         studio.ask_during((before, 32), 0, after)
     studio.ask(0, "a")

@@ -15,12 +15,12 @@ from scipy.spatial.transform import Rotation
 from ctm_plugin.cli import main as train
 from ctm_plugin.color.light import Light
 from ctm_plugin.rays.sampling import intersect_box
-from ctm_plugin.runs.load import KINDS
+from ctm_plugin.runs.load import VIEW_KINDS
 from ctm_plugin.runs.rundir import LAST
 from ctm_plugin.scene.views import Views
-from ctm_plugin.view.camera import Camera, view_camera
-from ctm_plugin.view.painter import Shot, Stopped
-from ctm_plugin.view.sources import CHUNK, Photograph, Subject
+from ctm_plugin.view.camera import BrowserCamera, view_camera
+from ctm_plugin.view.painter import Stopped, Viewpoint
+from ctm_plugin.view.sources import RAY_CHUNK, PhotographSource, Subject
 
 HEIGHT, WIDTH = 24, 32
 
@@ -35,22 +35,22 @@ def every(runs, forward_run, splat_run):
     return {**runs, "forward": forward_run, "splat": splat_run}
 
 
-def render(subject: Subject, camera: Camera, height: int, width: int, check=lambda: None, **shot) -> dict:
-    return subject.render(Shot(camera, **shot), height, width, check)
+def render(subject: Subject, camera: BrowserCamera, height: int, width: int, check=lambda: None, **shot) -> dict:
+    return subject.render(Viewpoint(camera, **shot), height, width, check)
 
 
-def paint(subject: Subject, camera: Camera, kind: str, longest: int, check=lambda: None, **shot) -> torch.Tensor:
+def paint(subject: Subject, camera: BrowserCamera, kind: str, longest: int, check=lambda: None, **shot) -> torch.Tensor:
     shot = {"background": (255, 255, 255) if subject.scene.background == "white" else (0, 0, 0)} | shot
     rendered = render(subject, camera, *camera.size(longest), check, **shot)
     return subject.picture(rendered, kind, subject.run.light)
 
 
-def camera_of(subject: Subject, index: int = 0, **changes) -> Camera:
+def camera_of(subject: Subject, index: int = 0, **changes) -> BrowserCamera:
     return replace(view_camera(subject.scene.test, index), **changes)
 
 
 @pytest.mark.parametrize("name", ["on", "forward", "splat"])
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", VIEW_KINDS)
 def test_at_a_test_view_it_is_what_evaluation_renders(every, name, kind):
     subject = Subject(every[name])
     views = subject.scene.test
@@ -72,7 +72,7 @@ def test_it_stops_when_told(runs):
 
     with pytest.raises(Stopped):
         paint(subject, camera, "rgb", 128, twice)
-    assert len(asked) == 3 < 128 * 128 / CHUNK
+    assert len(asked) == 3 < 128 * 128 / RAY_CHUNK
 
 
 @pytest.fixture(scope="module")
@@ -87,13 +87,13 @@ def anywhere(every):
     st.sampled_from([0.0, 1.0, 30.0, 1e6]),
     st.floats(0.01, 3.1),
     st.floats(0.1, 10.0),
-    st.sampled_from(KINDS),
+    st.sampled_from(VIEW_KINDS),
 )
 def test_cameras_may_stand_anywhere(anywhere, which, seed, distance, fov, aspect, kind):
     """Also beside and behind a forward-facing scene, where normalised device coordinates do not reach."""
     rng = np.random.default_rng(seed)
     wxyz, place = np.roll(Rotation.random(rng=rng).as_quat(), 1), rng.uniform(-distance, distance, 3)
-    camera = Camera(tuple(wxyz), tuple(place), fov, aspect)
+    camera = BrowserCamera(tuple(wxyz), tuple(place), fov, aspect)
     assert camera.usable()
     picture = paint(anywhere[which], camera, kind, 16)
     assert torch.isfinite(picture).all()
@@ -102,8 +102,8 @@ def test_cameras_may_stand_anywhere(anywhere, which, seed, distance, fov, aspect
 
 def test_behind_a_forward_facing_scene_there_is_nothing(forward_run):
     subject = Subject(forward_run)
-    away = Camera((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0.5, 1.0)
-    forward = Camera((0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0.5, 1.0)  # half a turn round x
+    away = BrowserCamera((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0.5, 1.0)
+    forward = BrowserCamera((0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0.5, 1.0)  # half a turn round x
     background = subject.run.module.decode(subject.run.module.transform.encode(torch.zeros(1, 3)))
     for camera, empty in ((away, True), (forward, False)):
         picture = paint(subject, camera, "rgb", 16)
@@ -113,7 +113,7 @@ def test_behind_a_forward_facing_scene_there_is_nothing(forward_run):
 @pytest.mark.parametrize("name", ["on", "splat"])
 def test_the_background_is_any(every, name):
     subject = Subject(every[name])
-    away = Camera((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 30.0), 0.5, 1.0)  # sees nothing
+    away = BrowserCamera((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 30.0), 0.5, 1.0)  # sees nothing
     picture = paint(subject, away, "rgb", 4, background=(255, 0, 51))
     transform = subject.run.module.transform
     expected = transform.decode(transform.encode(torch.tensor([[1.0, 0.0, 0.2]]))).detach()
@@ -238,18 +238,18 @@ def test_a_checkpoint_that_cannot_be_used_changes_nothing_but_is_told(finished, 
     assert torch.equal(paint(subject, camera_of(subject), "rgb", 12), before)
 
 
-def photograph(distortion: torch.Tensor | None = None) -> Photograph:
+def photograph(distortion: torch.Tensor | None = None) -> PhotographSource:
     """A picture that is smooth: x in red, y in green."""
     y, x = torch.meshgrid(torch.arange(HEIGHT) + 0.5, torch.arange(WIDTH) + 0.5, indexing="ij")
     image = torch.stack([x / WIDTH, y / HEIGHT, torch.full_like(x, 0.5)], dim=-1)[None]
     turn = Rotation.from_rotvec([0.3, -0.2, 0.5]).as_matrix()
     c2w = torch.from_numpy(np.column_stack([turn, [1.0, 2.0, 3.0]])).float()[None]
     lens = torch.tensor([[30.0, 30.0, WIDTH / 2, HEIGHT / 2]])
-    return Photograph("a view", Views(image, c2w, lens, ("a view",), distortion=distortion), 0, torch.zeros(1, 3))
+    return PhotographSource("a view", Views(image, c2w, lens, ("a view",), distortion=distortion), 0, torch.zeros(1, 3))
 
 
-def seen(of: Photograph, camera: Camera, height: int = HEIGHT, width: int = WIDTH) -> torch.Tensor:
-    return of.render(Shot(camera), height, width, lambda: None)["rgb"]
+def seen(of: PhotographSource, camera: BrowserCamera, height: int = HEIGHT, width: int = WIDTH) -> torch.Tensor:
+    return of.render(Viewpoint(camera), height, width, lambda: None)["rgb"]
 
 
 def test_from_its_own_camera_it_is_itself():
@@ -272,7 +272,7 @@ def test_it_turns_with_the_camera():
     camera = of.camera
     c2w = of.views.c2w[0].double().numpy()
     turn = Rotation.from_rotvec(-np.arctan(1 / 30) * c2w[:, 1]).as_matrix()
-    turned = Camera.of(np.column_stack([turn @ c2w[:, :3], c2w[:, 3]]), camera.fov, camera.aspect)
+    turned = BrowserCamera.of(np.column_stack([turn @ c2w[:, :3], c2w[:, 3]]), camera.fov, camera.aspect)
     middle = seen(of, turned)[HEIGHT // 2, WIDTH // 2 - 1]
     torch.testing.assert_close(middle, of.views.images[0, HEIGHT // 2, WIDTH // 2], atol=2e-3, rtol=0)
 
@@ -308,6 +308,6 @@ def test_lenses_are_undone():
 @pytest.mark.parametrize(("kind", "lifted"), [("rgb", False), ("lit", True), ("latent", True), ("depth", True)])
 def test_it_is_lifted_unless_the_run_is_not(kind, lifted):
     of = photograph()
-    rendered = of.render(Shot(of.camera), 6, 8, lambda: None)
+    rendered = of.render(Viewpoint(of.camera), 6, 8, lambda: None)
     picture = of.picture(rendered, kind, Light(3.0, 1.2))
     assert torch.equal(picture, Light(3.0, 1.2).apply(rendered["rgb"]) if lifted else rendered["rgb"])

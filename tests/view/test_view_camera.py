@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from ctm_plugin.scene.camera_paths import focus
 from ctm_plugin.scene.views import Scene, Views
-from ctm_plugin.view.camera import Camera, ahead
+from ctm_plugin.view.camera import BrowserCamera, ahead
 
 ORIGIN = (0.0, 0.0, 0.0)
 LEVEL = (1.0, 0.0, 0.0, 0.0)
@@ -22,17 +22,17 @@ UPSIDE = (0.0, 1.0, 0.0, 0.0)
 
 def test_opencv_becomes_opengl():
     # Unturned, OpenCV's camera looks along z, its y down: right is x, up -y, back -z.
-    camera = Camera(LEVEL, (1.0, 2.0, 3.0), 1.0, 1.5)
+    camera = BrowserCamera(LEVEL, (1.0, 2.0, 3.0), 1.0, 1.5)
     expected = torch.tensor([[1.0, 0, 0, 1], [0, -1, 0, 2], [0, 0, -1, 3]])
     torch.testing.assert_close(camera.c2w, expected, atol=1e-7, rtol=0)
-    torch.testing.assert_close(Camera(UPSIDE, ORIGIN, 1.0, 1.5).c2w, torch.eye(3, 4), atol=1e-7, rtol=0)
+    torch.testing.assert_close(BrowserCamera(UPSIDE, ORIGIN, 1.0, 1.5).c2w, torch.eye(3, 4), atol=1e-7, rtol=0)
 
 
 @given(st.integers(0, 10**6), st.floats(0.1, 3.0), st.floats(0.2, 5.0))
 def test_the_axis_and_the_corners(seed, fov, aspect):
     """The middle ray goes forward; rays through the edges' middles and the corners have the field of view."""
     turn = Rotation.random(rng=np.random.default_rng(seed))
-    camera = Camera(tuple(np.roll(turn.as_quat(), 1)), (1.0, -2.0, 3.0), fov, aspect)
+    camera = BrowserCamera(tuple(np.roll(turn.as_quat(), 1)), (1.0, -2.0, 3.0), fov, aspect)
     right, down, forward = turn.as_matrix().T
     rays = camera.rays(3, 5)
     assert (rays.origins == torch.tensor([1.0, -2, 3])).all()
@@ -50,7 +50,7 @@ def test_the_axis_and_the_corners(seed, fov, aspect):
     ("aspect", "size"), [(1.0, (64, 64)), (2.0, (32, 64)), (0.5, (64, 32)), (16 / 9, (36, 64)), (1e-9, (64, 1))]
 )
 def test_sizes(aspect, size):
-    assert Camera(LEVEL, ORIGIN, 1.0, aspect).size(64) == size
+    assert BrowserCamera(LEVEL, ORIGIN, 1.0, aspect).size(64) == size
 
 
 @pytest.mark.parametrize(
@@ -69,7 +69,7 @@ def test_sizes(aspect, size):
     ],
 )
 def test_what_is_a_camera(change, usable):
-    assert replace(Camera(LEVEL, ORIGIN, 1.0, 1.0), **change).usable() == usable
+    assert replace(BrowserCamera(LEVEL, ORIGIN, 1.0, 1.0), **change).usable() == usable
 
 
 def scene(geometry: str, c2w: torch.Tensor) -> Scene:

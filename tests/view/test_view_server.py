@@ -16,7 +16,7 @@ import viser
 from ctm_plugin.color.light import Light
 from ctm_plugin.view.command import view
 from ctm_plugin.view.page import NOTHING, PHOTOGRAPH, Page
-from ctm_plugin.view.painter import Look, Renderings, Shot
+from ctm_plugin.view.painter import Look, Renderings, Viewpoint
 from ctm_plugin.view.server import Viewer, admitted, check_free, names, page_address
 from ctm_plugin.view.settings import ViewConfig
 from ctm_plugin.view.sources import Subject
@@ -67,7 +67,7 @@ def test_it_begins_at_the_first_test_view_with_both_runs(page, viewer, subjects)
     assert look.sources == tuple(subjects)
     assert (look.kind, look.layout, look.split) == ("lit", "slider", 0.5)
     assert astuple(look.light) == pytest.approx(astuple(viewer.light))
-    assert look.shot == Shot(look.shot.camera, (255, 255, 255))  # the ball's
+    assert look.shot == Viewpoint(look.shot.camera, (255, 255, 255))  # the ball's
     assert limit == (300, 10.0)  # as large as the window
     assert viewer.views[0].seen_from(look.shot.camera)
 
@@ -133,7 +133,7 @@ def test_light_begins_where_it_is_told_and_lifts_what_is_lifted(subjects, viewer
     assert viewer.light == subjects[0].run.light
     with closing(Viewer(subjects[:1], at_free_port(light="3", contrast=1.5))) as another:
         assert another.light == Light(8.0, 1.5)
-    look = Look(Shot(viewer.views[0].camera), (subjects[0],), kind="lit")
+    look = Look(Viewpoint(viewer.views[0].camera), (subjects[0],), kind="lit")
     renderings = Renderings()
     more, less = (renderings.paint(look._replace(light=Light(f)), 8, lambda: None)[0] for f in (16.0, 2.0))
     plain, same = (renderings.paint(look._replace(kind="rgb", light=Light(f)), 8, lambda: None)[0] for f in (16.0, 2.0))

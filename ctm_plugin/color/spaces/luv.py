@@ -6,14 +6,17 @@ import torch
 
 from ctm_plugin.color.srgb import Colors, channels_of
 from ctm_plugin.color.transform import ColorTransform
-from ctm_plugin.color.xyz import CUBE_FROM, WHITE, cube_root, from_xyz, to_xyz
+from ctm_plugin.color.xyz import CUBE_FROM, D65_WHITE, cube_root, from_xyz, to_xyz
 
 DARK_SLOPE = 903.3
+"""Slope of L* over Y near black (CIE's kappa)."""
 
 # Chromaticities (u', v') of sRGB's triangle, rounded outwards. Points outside are moved in before decoding.
-WHITE_U = 4.0 * WHITE[0] / (WHITE[0] + 15.0 * WHITE[1] + 3.0 * WHITE[2])
-WHITE_V = 9.0 * WHITE[1] / (WHITE[0] + 15.0 * WHITE[1] + 3.0 * WHITE[2])
+WHITE_U = 4.0 * D65_WHITE[0] / (D65_WHITE[0] + 15.0 * D65_WHITE[1] + 3.0 * D65_WHITE[2])
+"""Chromaticity u', v' of the white point."""
+WHITE_V = 9.0 * D65_WHITE[1] / (D65_WHITE[0] + 15.0 * D65_WHITE[1] + 3.0 * D65_WHITE[2])
 U_RANGE = (0.12, 0.46)
+"""Ranges of u' and v' that the chromaticities of the sRGB gamut lie in."""
 V_RANGE = (0.15, 0.57)
 
 

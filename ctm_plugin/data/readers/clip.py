@@ -20,22 +20,24 @@ from jaxtyping import Float32
 from ctm_plugin.data.readers.folders import require_file, told
 from ctm_plugin.errors import CTMError, DataError
 
-CLIPS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".3gp", ".mts", ".m2ts")
-"""How clips end."""
-EXPECTED = "a whole clip that ffmpeg can read: copy it here again, or leave it out"
-WATCHED, LONGEST = 960, 1920
-"""Longer side in pixels of frames that are looked at, and of those that are written; larger ones are averaged."""
-WHITE = 203
+CLIP_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".3gp", ".mts", ".m2ts")
+"""Suffixes of clips."""
+CLIP_EXPECTED = "a whole clip that ffmpeg can read: copy it here again, or leave it out"
+WATCHED_SIDE, FRAME_SIDE = 960, 1920
+"""Longer side in pixels of frames whose movement is measured, and of those that are written; larger ones are
+averaged."""
+HDR_WHITE = 203
 """Light of white paper in HLG and PQ, cd/m² (ITU-R BT.2408)."""
-CURVES = {"arib-std-b67": "HLG", "smpte2084": "PQ"}
-WIDE = ("bt2020", "smpte431", "smpte432")
-"""Primaries that are not sRGB's, nor nearly."""
-NAMED = re.compile("bt|smpte|fcc|gbr|ycgco|ictcp").match
-"""Finds a matrix that a clip names."""
-EMPTY = re.match("(x)?(x)?(x)?", "")
-"""Where a clip does not tell."""
+HDR_CURVES = {"arib-std-b67": "HLG", "smpte2084": "PQ"}
+"""Transfer functions of HDR by ffmpeg's names."""
+WIDE_PRIMARIES = ("bt2020", "smpte431", "smpte432")
+"""ffmpeg's names of primaries that are neither sRGB's nor close to them."""
+MATRIX = re.compile("bt|smpte|fcc|gbr|ycgco|ictcp").match
+"""Matches ffmpeg's name of a YCbCr matrix."""
+NO_MATCH = re.match("(x)?(x)?(x)?", "")
+"""A match without groups, where ffmpeg names no duration or rate."""
 HD = 720
-"""Lines from which a clip without a tag has BT.709's matrix, as players take it; fewer have BT.601's."""
+"""Lines from which a clip without a tag has BT.709's matrix, as players assume; fewer have BT.601's."""
 
 
 class ClipHeader(NamedTuple):
@@ -62,15 +64,15 @@ def read_clip(path: Path) -> ClipHeader:
     Raises:
         DataError: it is no clip, or a damaged one.
     """
-    require_file(path, EXPECTED)
-    said = subprocess.run(_ffmpeg(path), capture_output=True, text=True, errors="replace").stderr
-    if " Video: " not in said:
-        found = "no moving pictures" if "Input #0" in said else f"a clip that cannot be read ({_first(said)})"
-        raise DataError(path, found, EXPECTED)
-    return header_of(said)
+    require_file(path, CLIP_EXPECTED)
+    output = subprocess.run(_ffmpeg(path), capture_output=True, text=True, errors="replace").stderr
+    if " Video: " not in output:
+        found = "no moving pictures" if "Input #0" in output else f"a clip that cannot be read ({_first(output)})"
+        raise DataError(path, found, CLIP_EXPECTED)
+    return header_of(output)
 
 
-def header_of(said: str) -> ClipHeader:
+def header_of(output: str) -> ClipHeader:
     """A clip's header out of what ffmpeg prints of it.
 
     Example:
@@ -79,32 +81,32 @@ def header_of(said: str) -> ClipHeader:
         >>> header_of("Duration: 00:01:00.50, start: 0\\n Video: h264, yuv420p(progressive), 1280x720, 30 fps")
         ClipHeader(count=1815, curve='', primaries='', deep=False, matrix='bt709')
     """
-    line = next(each for each in said.splitlines() if "Video: " in each and "attached pic" not in each)
-    hours, minutes, seconds = (re.search(r"Duration: (\d+):(\d+):([\d.]+)", said) or EMPTY).groups("0")
-    rate = (re.search(r"([\d.]+) fps", line) or EMPTY)[1] or 0
+    line = next(each for each in output.splitlines() if "Video: " in each and "attached pic" not in each)
+    hours, minutes, seconds = (re.search(r"Duration: (\d+):(\d+):([\d.]+)", output) or NO_MATCH).groups("0")
+    rate = (re.search(r"([\d.]+) fps", line) or NO_MATCH)[1] or 0
     kind, tags, lines = re.search(r", (\w+)(?:\(([^)]*)\))?, \d+x(\d+)", line).groups("")
     named = next((part for part in tags.split(", ") if "/" in part), tags)
     words = re.split(r"[ ,/]+", named)
     matrix = words[:1] if "/" in named else words
-    curve = next((word for word in words if word in CURVES), "")
+    curve = next((word for word in words if word in HDR_CURVES), "")
     return ClipHeader(
         count=round((int(hours) * 3600 + int(minutes) * 60 + float(seconds)) * float(rate)),
         curve=curve,
-        primaries=next((word for word in words if word in WIDE), "bt2020" if curve else ""),
+        primaries=next((word for word in words if word in WIDE_PRIMARIES), "bt2020" if curve else ""),
         deep=bool(re.search(r"(p\d?|gray)(9|1[0246])[lb]e$", kind)),
-        matrix="" if any(map(NAMED, matrix)) else "bt2020nc" if curve else "bt709" if int(lines) >= HD else "bt601",
+        matrix="" if any(map(MATRIX, matrix)) else "bt2020nc" if curve else "bt709" if int(lines) >= HD else "bt601",
     )
 
 
 def watched(path: Path) -> Iterator[Float32[np.ndarray, "h w"]]:
-    """A clip's frames one after the other, grey ``[H, W]`` of sRGB-like codes in [0, 1], at most ``WATCHED`` long.
+    """A clip's frames one after the other, grey ``[H, W]`` of sRGB-like codes in [0, 1], at most ``WATCHED_SIDE`` long.
 
     A clip that ends too early gives what it has, with a warning.
 
     Raises:
         DataError: not one frame can be read.
     """
-    filters = f"scale=iw*sar:ih,{_at_most(WATCHED)},setsar=1,format=gray16be"
+    filters = f"scale=iw*sar:ih,{_at_most(WATCHED_SIDE)},setsar=1,format=gray16be"
     with _running(path, "-vf", filters, "-f", "image2pipe", "-c:v", "pgm", "-") as out:
         while head := out.readline():
             width, height = map(int, out.readline().split())
@@ -118,14 +120,14 @@ def watched(path: Path) -> Iterator[Float32[np.ndarray, "h w"]]:
 def write_frames(path: Path, numbers: Sequence[int], folder: Path) -> ClipHeader:
     """Write frames of a clip, numbered from 0, as ``0001.png`` and so on: sRGB, 16 bits where the clip has more than 8.
 
-    HLG and PQ become sRGB with ``WHITE`` as 1; what is brighter is clipped, what is darker stays in proportion.
+    HLG and PQ become sRGB with ``HDR_WHITE`` as 1; what is brighter is clipped, what is darker stays in proportion.
 
     Returns:
         What the clip says of itself.
     """
     header = read_clip(path)
     chosen = "+".join(f"eq(n,{number})" for number in numbers)
-    shrunk = f"scale=iw*sar:ih,{_at_most(LONGEST)},setsar=1"
+    shrunk = f"scale=iw*sar:ih,{_at_most(FRAME_SIDE)},setsar=1"
     filters = [f"select='{chosen}'", *srgb_filters(header), shrunk, "format=rgb48be" if header.deep else "format=rgb24"]
     with _running(path, "-vf", ",".join(filters), "-frames:v", str(len(numbers)), str(folder / "%04d.png")):
         pass
@@ -138,7 +140,7 @@ def srgb_filters(header: ClipHeader) -> list[str]:
         return [f"scale=in_color_matrix={header.matrix}:out_color_matrix=bt709"] if header.matrix else []
     stored = f"min={header.matrix}:" if header.matrix else ""
     stored += f"tin={header.curve or 'bt709'}:pin={header.primaries}"
-    curve, white = ("iec61966-2-1", WHITE) if header.curve else ("bt709", 100)
+    curve, white = ("iec61966-2-1", HDR_WHITE) if header.curve else ("bt709", 100)
     light, codes = f"{stored}:t=linear:npl={white}", f"p=bt709:t={curve}"  # agamma: the standards' own formulas
     return [f"zscale={light}:agamma=false", "format=gbrpf32le", f"zscale={codes}:agamma=false", "format=gbrp16le"]
 
@@ -174,12 +176,12 @@ def _running(path: Path, *arguments: str) -> Iterator[IO[bytes]]:
         log.seek(0)
         complaints = log.read().decode(errors="replace")
     if code:
-        raise DataError(path, f"a clip that cannot be read ({_first(complaints)})", EXPECTED)
+        raise DataError(path, f"a clip that cannot be read ({_first(complaints)})", CLIP_EXPECTED)
     if "partial file" in complaints or "Truncated" in complaints:
         warnings.warn(f"{path}: the clip ends too early; what there is of it is used", stacklevel=4)
 
 
 def _first(complaints: str) -> str:
     """ffmpeg's first complaint, the cause of others, without the part of it that complains."""
-    found = re.findall(r"^\[[^\]]* @ [^\]]*\] (.+)$", complaints, re.M)
-    return next((each for each in found if "low score" not in each), " ".join(complaints.split()[-12:]))
+    messages = re.findall(r"^\[[^\]]* @ [^\]]*\] (.+)$", complaints, re.M)
+    return next((each for each in messages if "low score" not in each), " ".join(complaints.split()[-12:]))

@@ -1,6 +1,6 @@
 """COLMAP's model: ``cameras``, ``images`` and ``points3D``, binary or text, read with only numpy and scipy.
 
-Text is packed into the bytes of the binary files, so that both are read and checked in one place.
+Text, which scripts write, is packed into the bytes of the binary files: both are read and checked in one place.
 """
 
 from __future__ import annotations
@@ -20,24 +20,26 @@ from jaxtyping import Float64, Int64
 from scipy.spatial.transform import Rotation
 
 from ctm_plugin.data.readers.folders import read_bytes
-from ctm_plugin.data.readers.lens import Camera
+from ctm_plugin.data.readers.lens import Intrinsics
 from ctm_plugin.errors import DataError
 from ctm_plugin.scene.poses import MAX_COORDINATE
 
-NAMES = (
+MODEL_NAMES = (
     "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV", "FOV",
     "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "THIN_PRISM_FISHEYE", "RAD_TAN_THIN_PRISM_FISHEYE", "SIMPLE_DIVISION",
     "DIVISION", "SIMPLE_FISHEYE", "FISHEYE", "EUCM", "EQUIRECTANGULAR",
 )  # fmt: skip
-"""Of COLMAP's camera models, by its numbers."""
-PARAMETERS = {"SIMPLE_PINHOLE": 3, "PINHOLE": 4, "SIMPLE_RADIAL": 4, "RADIAL": 5, "OPENCV": 8, "FULL_OPENCV": 12}
-"""How many numbers those have that are pinholes with OpenCV's distortion."""
+"""Names of COLMAP's camera models, at their numbers."""
+MODEL_PARAMETERS = {"SIMPLE_PINHOLE": 3, "PINHOLE": 4, "SIMPLE_RADIAL": 4, "RADIAL": 5, "OPENCV": 8, "FULL_OPENCV": 12}
+"""Number of parameters of each model that is a pinhole with OpenCV's distortion."""
 UNDISTORT = "colmap image_undistorter makes pinholes of others"
 MAX_SIDE = 2**20
-SHOWN = "as_shown.txt"
-"""Beside a model of ``ctm cameras``, which looks at pictures as EXIF turns them; COLMAP looks at stored pixels."""
+"""Largest side in pixels that a camera may have."""
+UPRIGHT_NOTE = "as_shown.txt"
+"""Name of the file that marks a model of upright pictures, as ``ctm cameras`` makes it; COLMAP's own is of stored
+pixels."""
 NOT_A_NUMBER = re.compile(r"[+-]?(nan|inf|1\.#)", re.IGNORECASE)
-"""How Windows' programs write NaN and infinity begins: ``-nan(ind)``, ``1.#QNAN``."""
+"""How NaN and infinity are written, on Windows too: ``-nan(ind)``, ``1.#QNAN``."""
 
 
 def model_file(folder: Path, name: str) -> Path:
@@ -48,19 +50,19 @@ def model_file(folder: Path, name: str) -> Path:
 
 def mark_as_shown(folder: Path, searched: Sequence[str]) -> None:
     """Write down that a model is of pictures as EXIF's orientation turns them, and which were looked at for it."""
-    told = f"Cameras of the pictures as EXIF's orientation turns them. images.bin: sha256 {_digest(folder)}"
-    (folder / SHOWN).write_text("\n".join([told, *searched, ""]), "utf-8")
+    note = f"Cameras of the pictures as EXIF's orientation turns them. images.bin: sha256 {_digest(folder)}"
+    (folder / UPRIGHT_NOTE).write_text("\n".join([note, *searched, ""]), "utf-8")
 
 
 def searched_in(folder: Path) -> set[str]:
     """The pictures that were looked at for the model that lies there now, by :func:`mark_as_shown`; none: it is not."""
-    return {*(folder / SHOWN).read_text("utf-8").split("\n")[1:-1]} if is_as_shown(folder) else set()
+    return {*(folder / UPRIGHT_NOTE).read_text("utf-8").split("\n")[1:-1]} if is_as_shown(folder) else set()
 
 
 def is_as_shown(folder: Path) -> bool:
     """Tell whether :func:`mark_as_shown` marked the model that lies there now."""
-    there = all((folder / name).is_file() for name in (SHOWN, "images.bin"))
-    return there and _digest(folder) in (folder / SHOWN).read_text("utf-8", "replace")
+    there = all((folder / name).is_file() for name in (UPRIGHT_NOTE, "images.bin"))
+    return there and _digest(folder) in (folder / UPRIGHT_NOTE).read_text("utf-8", "replace")
 
 
 def _digest(folder: Path) -> str:
@@ -136,7 +138,7 @@ def as_binary(path: Path) -> tuple[bytes, list[tuple[int, int]]]:
     Returns:
         That, and for each record where it begins there and on which line of the text it stands.
     """
-    pack, expected = LINES[path.stem]
+    pack, expected = TEXT_LAYOUTS[path.stem]
     content = read_bytes(path, "a file of COLMAP's text model")
     lines = enumerate(content.decode(json.detect_encoding(content), "replace").splitlines(), 1)  # also Windows' UTF-16
     parts, places, length = [], [], 8  # the count comes first
@@ -159,11 +161,11 @@ def decimal(text: str) -> float:
 
 def pack_camera(line: str, _: str) -> bytes:
     number, model, width, height, *values = line.split()
-    if model not in NAMES:
+    if model not in MODEL_NAMES:
         raise ValueError(repr(model))
-    if len(values) != PARAMETERS.get(model, len(values)):
-        raise ValueError(f"{len(values)} parameters, {model} has {PARAMETERS[model]}")
-    head = struct.pack("<iiQQ", int(number), NAMES.index(model), int(width), int(height))
+    if len(values) != MODEL_PARAMETERS.get(model, len(values)):
+        raise ValueError(f"{len(values)} parameters, {model} has {MODEL_PARAMETERS[model]}")
+    head = struct.pack("<iiQQ", int(number), MODEL_NAMES.index(model), int(width), int(height))
     return head + struct.pack(f"<{len(values)}d", *map(decimal, values))
 
 
@@ -183,30 +185,30 @@ def pack_point(line: str, _: str) -> bytes:
     return struct.pack("<Q3d11xQ", int(number), *map(decimal, position), 0)
 
 
-LINES: dict[str, tuple[Callable[[str, str], bytes], str]] = {
+TEXT_LAYOUTS: dict[str, tuple[Callable[[str, str], bytes], str]] = {
     "cameras": (pack_camera, "ID MODEL WIDTH HEIGHT PARAMETERS"),
     "images": (pack_image, "ID QW QX QY QZ TX TY TZ CAMERA NAME, and its points X Y POINT on the next line"),
     "points3D": (pack_point, "ID X Y Z R G B ERROR TRACK"),
 }
-"""What packs a line of each file, with the line after it, and what it holds."""
+"""By file: the function that packs a line of text, with the next line, and what the line holds."""
 
 
-def read_cameras(path: Path) -> dict[int, Camera | DataError]:
+def read_cameras(path: Path) -> dict[int, Intrinsics | DataError]:
     """Cameras by their numbers; in place of one with impossible numbers its fault."""
     cursor = Cursor(path)
     cameras = {}
     for _ in range(cursor.count(24, "cameras")):
         number, model, width, height = cursor.take("iiQQ", "camera")
-        name = NAMES[model] if 0 <= model < len(NAMES) else f"number {model}"
-        if name not in PARAMETERS:
+        name = MODEL_NAMES[model] if 0 <= model < len(MODEL_NAMES) else f"number {model}"
+        if name not in MODEL_PARAMETERS:
             way = "pictures cut out of the panorama" if name == "EQUIRECTANGULAR" else UNDISTORT
-            raise cursor.fault(f"camera {number} of model {name}", f"one of {', '.join(PARAMETERS)}: {way}")
-        values = cursor.take(f"{PARAMETERS[name]}d", f"parameters of camera {number}")
+            raise cursor.fault(f"camera {number} of model {name}", f"one of {', '.join(MODEL_PARAMETERS)}: {way}")
+        values = cursor.take(f"{MODEL_PARAMETERS[name]}d", f"parameters of camera {number}")
         try:
             if not (1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE):
                 raise cursor.fault(f"camera {number} of {width}x{height} pixels", f"sides from 1 to {MAX_SIDE}")
             own = parameters(cursor, name, values)
-            cameras[number] = Camera(float(width), float(height), *own, f"camera {number}")
+            cameras[number] = Intrinsics(float(width), float(height), *own, f"camera {number}")
         except DataError as fault:
             cameras[number] = fault
     return cameras
@@ -226,7 +228,7 @@ def parameters(cursor: Cursor, name: str, values: tuple[float, ...]) -> tuple:
     return *focal, cx, cy, (k1, k2, 0.0, 0.0, 0.0) if single else (k1, k2, p1, p2, k3)
 
 
-def read_images(path: Path, cameras: dict[int, Camera | DataError]) -> list[Taken | DataError]:
+def read_images(path: Path, cameras: dict[int, Intrinsics | DataError]) -> list[Taken | DataError]:
     """The registered pictures; in place of one with an impossible pose or camera its fault."""
     cursor = Cursor(path)
     taken = []

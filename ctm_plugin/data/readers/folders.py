@@ -12,16 +12,18 @@ from pathlib import Path, PurePosixPath, PureWindowsPath
 
 from ctm_plugin.errors import CTMError, DataError
 
-PHONES = (".heic", ".heif", ".hif", ".avif")
-IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".exr", *PHONES)
-FOREIGN = (".bmp", ".gif", ".ppm", ".pgm", ".jp2", ".tga")
-"""How pictures end that are not read."""
-POINTER = b"version https://git-lfs"
-RAWS = (
+PHONE_SUFFIXES = (".heic", ".heif", ".hif", ".avif")
+"""Suffixes of pictures from phones."""
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".exr", *PHONE_SUFFIXES)
+UNREAD_SUFFIXES = (".bmp", ".gif", ".ppm", ".pgm", ".jp2", ".tga")
+"""Suffixes of pictures that are not read."""
+LFS_POINTER = b"version https://git-lfs"
+"""First bytes of a file that Git LFS has not fetched."""
+RAW_SUFFIXES = (
     ".dng", ".nef", ".nrw", ".cr2", ".cr3", ".crw", ".arw", ".srf", ".sr2", ".raf", ".orf", ".rw2", ".rwl", ".pef",
     ".srw", ".raw", ".iiq", ".3fr", ".fff", ".x3f", ".erf", ".kdc",
 )  # fmt: skip
-"""How raw pictures of cameras end."""
+"""Suffixes of raw pictures."""
 RAW_HINT = (
     "raw pictures developed all alike to TIFF of 16 bits; raw ones are read in RawNeRF's layout, by dataset=rawnerf"
 )
@@ -29,9 +31,9 @@ RAW_HINT = (
 
 def others_hint(paths: Iterable[Path]) -> str:
     """Say how to turn the first of these that is a picture of another kind into one that is read."""
-    known = (*FOREIGN, *IMAGE_SUFFIXES)
+    known = (*UNREAD_SUFFIXES, *IMAGE_SUFFIXES)
     path = next((path for path in paths if path.suffix.lower() in known), Path("images", "1.BMP"))
-    into = "png" if path.suffix.lower() in FOREIGN else path.suffix[1:]
+    into = "png" if path.suffix.lower() in UNREAD_SUFFIXES else path.suffix[1:]
     return f"others turned into these first (mogrify -format {into} {shlex.quote(str(path.parent))}/*{path.suffix})"
 
 
@@ -78,10 +80,10 @@ def require_file(path: Path, expected: str) -> None:
         if not path.is_file():
             raise DataError(path, "something that is not a file", expected)
         with path.open("rb") as file:
-            head = file.read(len(POINTER))
+            head = file.read(len(LFS_POINTER))
         if not head:
             raise DataError(path, "an empty file", expected)
-        if head == POINTER:
+        if head == LFS_POINTER:
             raise DataError(path, "a Git LFS pointer in place of the file", f"{expected}: git lfs pull fetches it")
 
 
@@ -90,17 +92,6 @@ def read_bytes(path: Path, expected: str) -> bytes:
     require_file(path, expected)
     with told(path, "a file that cannot be read", expected):
         return path.read_bytes()
-
-
-def refuse_links(root: Path) -> None:
-    """Refuse a folder that holds links to what lies outside it (``dataset.links=false``)."""
-    expected = "no links out of the data set's folder, or dataset.links=true"
-    with told(root, "a folder that cannot be read", expected):
-        home = root.resolve()
-        for folder, folders, names in os.walk(root):
-            for path in (Path(folder, name) for name in (*folders, *names)):
-                if path.is_symlink() and not path.resolve().is_relative_to(home):
-                    raise DataError(path, f"a link to {path.resolve()}", expected)
 
 
 def is_picture(path: Path) -> bool:
@@ -151,8 +142,8 @@ def look_for(root: Path, name: str, source: Path) -> Path | None:
         home = root
         for folder in folders:
             home = home / folder if (home / folder).is_dir() else folded(home).get(fold(folder), home / folder)
-        found = (folded(home).get(fold(last + suffix)) for suffix in ("", *IMAGE_SUFFIXES))
-        return next((path for path in found if path and path.is_file()), None)
+        candidates = (folded(home).get(fold(last + suffix)) for suffix in ("", *IMAGE_SUFFIXES))
+        return next((path for path in candidates if path and path.is_file()), None)
 
 
 def fold(name: str) -> str:

@@ -6,36 +6,37 @@ import math
 import warnings
 from collections.abc import Callable, Iterable
 from contextlib import suppress
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
 
-from ctm_plugin.data.readers.lens import NEARLY, Camera
+from ctm_plugin.data.readers.lens import CROP_RATIOS, Intrinsics
 from ctm_plugin.data.readers.records import Record, read_record
 from ctm_plugin.errors import DataError
 from ctm_plugin.scene.poses import MAX_COORDINATE, check_pose, is_field_of_view
 from ctm_plugin.settings.setting import Number
 
-MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
+PINHOLE_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
 """Values of ``camera_model`` that are pinholes with OpenCV's distortion."""
 MAX_PIXEL = 1e6
 """Largest focal length and coordinate in pixels."""
-AGREE = 0.02
-"""How far a focal length and a field of view may be apart, of 1."""
-NARROW, WIDE = math.radians(5), math.radians(170)
-"""Fields of view: a narrower one is remarked on, a wider one no lens without a fisheye's projection has."""
-ASIDE, OUTSIDE = 0.25, 1.5
-"""How far the principal point may be from the picture's middle, in sides, before it is remarked on or refused."""
-ALIKE = 0.2
-"""How far apart width and height may have grown, of 1, by what a principal point near the middle says."""
-SIZE = ("w", "h")
-LENS = ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "k3", "p1", "p2", "camera_angle_y", "camera_model")
-"""What a file says of its lenses where ``camera_angle_x`` is not all."""
-MASK = "mask_path"
-NO_FISHEYE = f"no fisheye lens but one of {', '.join(MODELS)}"
+FOCAL_TOLERANCE = 0.02
+"""Largest relative difference between a focal length and the one that a field of view implies."""
+NARROW_VIEW, MAX_VIEW = math.radians(5), math.radians(170)
+"""Fields of view in radians: below the first there is a warning, above the second no pinhole is possible."""
+FAR_PRINCIPAL, MAX_PRINCIPAL = 0.25, 1.5
+"""Distance of the principal point from the middle, in sides, from which there is a warning, and an error."""
+SCALE_TOLERANCE = 0.2
+"""Largest relative difference of the two scales that a principal point near the middle implies."""
+SIZE_KEYS = ("w", "h")
+LENS_KEYS = ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "k3", "p1", "p2", "camera_angle_y", "camera_model")
+"""Keys that describe a lens by more than ``camera_angle_x``."""
+MASK_KEY = "mask_path"
+NO_FISHEYE = f"no fisheye lens but one of {', '.join(PINHOLE_MODELS)}"
 BY_NAME = "fl_x, fl_y, cx, cy and k1, k2, k3, p1, p2, a number each"
 ONE_POSE = "one pose a picture, transform_matrix, as nerfstudio and instant-ngp write it by default"
-REFUSED = {
+REFUSED_KEYS = {
     **dict.fromkeys(("is_fisheye", "k4", "k5", "k6", "fisheye_crop_radius", "latlong", "equirectangular"), NO_FISHEYE),
     **dict.fromkeys(("ftheta_p0", "ftheta_p1", "ftheta_p2", "ftheta_p3", "ftheta_p4"), NO_FISHEYE),
     **dict.fromkeys(("distortion_params", "intrinsics", "intrinsic_matrix", "camera_matrix", "K", "focal"), BY_NAME),
@@ -43,10 +44,11 @@ REFUSED = {
     **dict.fromkeys(("rolling_shutter", "transform_matrix_start", "transform_matrix_end"), ONE_POSE),
     **dict.fromkeys(("from_mitsuba", "from_na"), ONE_POSE),
 }  # fmt: skip
-"""What changes a camera's rays in a way that is not known here: refused unless it is 0, false or null."""
-OF_FRAMES = ("file_path", MASK, "transform_matrix")
-OF_FILES = ("frames", "near", "far", "train_filenames", "val_filenames", "test_filenames", "ply_file_path")
-HARMLESS = (
+"""Keys that change a camera's rays in an unknown way, with what is expected: refused unless they are 0, false or
+null."""
+FRAME_KEYS = ("file_path", MASK_KEY, "transform_matrix")
+FILE_KEYS = ("frames", "near", "far", "train_filenames", "val_filenames", "test_filenames", "ply_file_path")
+IGNORED_KEYS = (
     # Of nerfstudio: how its poses came about, what it does with them later, and depth, which is not read.
     "applied_transform", "applied_scale", "orientation_override", "auto_scale_poses_override", "colmap_im_id",
     "depth_file_path", "depth_unit_scale_factor",
@@ -56,7 +58,7 @@ HARMLESS = (
     # Of Synthetic-NeRF and of our renderer.
     "rotation", "depth_scale",
 )  # fmt: skip
-"""What known tools write that says nothing about the cameras, or only of what has been done already."""
+"""Keys of known tools that do not concern the cameras, or tell what has been applied already."""
 
 
 def says(owner: Record, key: str) -> bool:
@@ -68,22 +70,26 @@ def says(owner: Record, key: str) -> bool:
 def angle_alone(path: Path) -> bool:
     """Tell whether a file gives its cameras only by ``camera_angle_x``, as Synthetic-NeRF's; or it is broken."""
     with suppress(DataError):
-        record = read_record(path)
-        owners = [record, *(frames_of(record) if record.values.get("frames") else ())]
-        return not any(says(owner, key) for owner in owners for key in (*LENS, *REFUSED, MASK))
+        return _angle_alone(read_record(path))
     return True
+
+
+@lru_cache(maxsize=4)
+def _angle_alone(record: Record) -> bool:
+    owners = [record, *(frames_of(record) if record.values.get("frames") else ())]
+    return not any(says(owner, key) for owner in owners for key in (*LENS_KEYS, *REFUSED_KEYS, MASK_KEY))
 
 
 def check_keys(owners: Iterable[Record]) -> None:
     """Refuse what cannot be done, and say in one warning what is not known, of files, each followed by its frames."""
     owners = list(owners)
-    masked = any(says(owner, MASK) for owner in owners)
-    known = {*SIZE, *LENS, *REFUSED, *OF_FRAMES, *OF_FILES, *HARMLESS, "camera_angle_x"}
+    masked = any(says(owner, MASK_KEY) for owner in owners)
+    known = {*SIZE_KEYS, *LENS_KEYS, *REFUSED_KEYS, *FRAME_KEYS, *FILE_KEYS, *IGNORED_KEYS, "camera_angle_x"}
     unknown: dict[str, Path] = {}
     for owner in owners:
         for key in owner.values:
-            if key in REFUSED and says(owner, key):
-                raise owner.fault(key, REFUSED[key])
+            if key in REFUSED_KEYS and says(owner, key):
+                raise owner.fault(key, REFUSED_KEYS[key])
             if "mask" in key and key not in known and says(owner, key) and not (masked and owner.values[key] is True):
                 raise owner.fault(key, "masks under mask_path, whose bright pixels count, or no such key")
             if key not in known and not ("mask" in key and isinstance(owner.values[key], bool)):
@@ -109,7 +115,7 @@ def read_pose(frame: Record) -> np.ndarray:
     return pose[:3]
 
 
-def read_camera(record: Record, frame: Record, width: int, height: int, remarks: dict[str, str]) -> Camera:
+def read_camera(record: Record, frame: Record, width: int, height: int, remarks: dict[str, str]) -> Intrinsics:
     """The camera of one frame: each of its numbers the frame's own, else the file's, else the picture's.
 
     ``remarks`` gets the remarks on the cameras, once for each key.
@@ -122,8 +128,8 @@ def read_camera(record: Record, frame: Record, width: int, height: int, remarks:
         owner = given(key)
         return usual if owner is None else owner.number(key, allowed, expected)
 
-    if (owner := given("camera_model")) and owner.values["camera_model"] not in MODELS:
-        raise owner.fault("camera_model", f"one of {', '.join(MODELS)}: undistort the pictures of others first")
+    if (owner := given("camera_model")) and owner.values["camera_model"] not in PINHOLE_MODELS:
+        raise owner.fault("camera_model", f"one of {', '.join(PINHOLE_MODELS)}: undistort the pictures of others first")
     pixels = "a number of pixels > 0"
     width = number("w", float(width), is_length, pixels)
     height = number("h", float(height), is_length, pixels)
@@ -158,17 +164,17 @@ def read_camera(record: Record, frame: Record, width: int, height: int, remarks:
 
     centre = any_number("cx", 0.5 * width), any_number("cy", 0.5 * height)
     lens = tuple(map(any_number, ("k1", "k2", "p1", "p2", "k3")))
-    camera = Camera(width, height, fx, fx if fy is None else fy, *centre, lens, where=frame.where)
+    camera = Intrinsics(width, height, fx, fx if fy is None else fy, *centre, lens, where=frame.where)
     check_view(camera, record.source, bool(given("w") and given("h")), remarks)
     return camera
 
 
 def differ(length: float | None, other: float | None) -> bool:
-    """Tell whether two focal lengths are there and further apart than ``AGREE``."""
-    return length is not None and other is not None and abs(other / length - 1) > AGREE
+    """Tell whether two focal lengths are there and further apart than ``FOCAL_TOLERANCE``."""
+    return length is not None and other is not None and abs(other / length - 1) > FOCAL_TOLERANCE
 
 
-def check_view(camera: Camera, source: Path, sized: bool, remarks: dict[str, str]) -> None:
+def check_view(camera: Intrinsics, source: Path, sized: bool, remarks: dict[str, str]) -> None:
     """Refuse intrinsics that are not of a picture of the camera's size, and remark on those that few lenses have.
 
     ``sized`` is whether the file tells the camera's size; else it is the picture's.
@@ -176,8 +182,8 @@ def check_view(camera: Camera, source: Path, sized: bool, remarks: dict[str, str
     width, height, cx, cy = camera.width, camera.height, camera.cx, camera.cy
     found = f"{camera.where} with fl_x {camera.fx:g}, fl_y {camera.fy:g}, cx {cx:g}, cy {cy:g} for {width:g}x{height:g}"
     larger, parts = (2 * cx / width, 2 * cy / height), 0 < cx < 1 and 0 < cy < 1
-    other = min(larger) > NEARLY[1] or max(larger) < NEARLY[0]
-    if other and not (sized or parts) and abs(larger[0] - larger[1]) < ALIKE * larger[0]:
+    other = min(larger) > CROP_RATIOS[1] or max(larger) < CROP_RATIOS[0]
+    if other and not (sized or parts) and abs(larger[0] - larger[1]) < SCALE_TOLERANCE * larger[0]:
         expected = f"w and h of the pictures that these numbers are of, about {2 * cx:g}x{2 * cy:g}"
         raise DataError(source, found, expected)
     views = [
@@ -185,12 +191,12 @@ def check_view(camera: Camera, source: Path, sized: bool, remarks: dict[str, str
         for start, side, focal in ((cx, width, camera.fx), (cy, height, camera.fy))
     ]
     off = max(abs(cx / width - 0.5), abs(cy / height - 0.5))
-    if parts or max(views) > WIDE or off > OUTSIDE:
+    if parts or max(views) > MAX_VIEW or off > MAX_PRINCIPAL:
         expected = "pixels of a picture of this size: parts of the sides are to be multiplied by w and h, and numbers "
         raise DataError(source, found, expected + "of another size go with its w and h")
-    if off > ASIDE:
+    if off > FAR_PRINCIPAL:
         remarks.setdefault("cx", f"the principal point is far from the picture's middle: {found}, in pixels")
-    if max(views) < NARROW:
+    if max(views) < NARROW_VIEW:
         angle = math.degrees(max(views))
         remarks.setdefault("fl_x", f"a field of view of {angle:.2g} degrees: {found}, in pixels")
 

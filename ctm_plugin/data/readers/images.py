@@ -10,37 +10,37 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float32, UInt8, UInt16
+from jaxtyping import Float32, UInt8
 from PIL import ExifTags, Image
 from torch import Tensor
 
 from ctm_plugin.color.srgb import linear_to_srgb
-from ctm_plugin.data.readers.exr import open_exr
-from ctm_plugin.data.readers.folders import PHONES, others_hint, require_file, told
+from ctm_plugin.data.readers.deep import colored, numbers, open_deep, opened_file
+from ctm_plugin.data.readers.folders import PHONE_SUFFIXES, others_hint, require_file, told
 from ctm_plugin.data.readers.picture import (
     MAX_PIXELS,
-    UPRIGHT,
+    UPRIGHT_ORIENTATION,
     Decoder,
     Header,
     Opened,
     check_size,
     exposure_of,
     lens_of,
-    shown,
     turn,
+    upright_header,
 )
 from ctm_plugin.data.readers.profiles import as_srgb, foreign, heif_colours, png_colours, png_gamma
-from ctm_plugin.data.readers.tiff import open_tiff
 from ctm_plugin.errors import CTMError, DataError
 
-FORMATS = ("PNG", "JPEG", "WEBP", "AVIF")
-SIGNATURES = {
+PILLOW_FORMATS = ("PNG", "JPEG", "WEBP", "AVIF")
+"""Formats that Pillow decodes here."""
+FOREIGN_SIGNATURES = {
     b"GIF8": "GIF", b"BM": "BMP", b"P5": "PGM", b"P6": "PPM", b"II*\0": "TIFF", b"MM\0*": "TIFF"
 }  # fmt: skip
-"""How others that are not read under such a name begin."""
-AVIF = (b"avif", b"avis")
-"""Which of the files that begin with a ``ftyp`` box Pillow reads by itself."""
-GREY = ("1", "L", "LA", "I;16", "I")
+"""First bytes of formats that are not read under such a suffix."""
+AVIF_BRANDS = (b"avif", b"avis")
+"""Brands of an ``ftyp`` box that Pillow reads without a plug-in."""
+GREY_MODES = ("1", "L", "LA", "I;16", "I")
 """Pillow's modes without colour."""
 
 
@@ -50,18 +50,18 @@ warnings.filterwarnings("ignore", category=Image.DecompressionBombWarning)  # th
 @contextmanager
 def opened(path: Path) -> Iterator[Image.Image]:
     """The picture, not yet decoded."""
-    expected = f"a whole image ({', '.join(FORMATS)}, HEIC) of at most {MAX_PIXELS} pixels"
+    expected = f"a whole image ({', '.join(PILLOW_FORMATS)}, HEIC) of at most {MAX_PIXELS} pixels"
     require_file(path, expected)
     with told(path, "an image that cannot be read", f"{expected}: copy it here again, or leave it out"):
         with path.open("rb") as file:
             head = file.read(12)
-        heif = head[4:8] == b"ftyp" and head[8:] not in AVIF
+        heif = head[4:8] == b"ftyp" and head[8:] not in AVIF_BRANDS
         try:
-            image = Image.open(path, formats=(*FORMATS, *heif_formats()) if heif else FORMATS)
+            image = Image.open(path, formats=(*PILLOW_FORMATS, *heif_formats()) if heif else PILLOW_FORMATS)
         except Image.UnidentifiedImageError as error:
             if head[4:8] == b"ftyp":
                 raise OSError("damaged, or of no kind that is known") from error
-            kind = next((kind for start, kind in SIGNATURES.items() if head.startswith(start)), None)
+            kind = next((kind for start, kind in FOREIGN_SIGNATURES.items() if head.startswith(start)), None)
             found = f"a picture of {kind}'s kind" if kind else "something that is not an image"
             raise DataError(path, found, f"{expected}; {others_hint([path])}") from error
         with image:
@@ -77,11 +77,6 @@ def heif_formats() -> tuple[str, ...]:
         raise CTMError(f"reading HEIC needs pillow-heif: pip install -e '.[photos]' ({error})") from error
     register_heif_opener()
     return ("HEIF",)
-
-
-def raw_mode(image: Image.Image) -> str:
-    """How Pillow would unpack a PNG's samples: ``RGB;16B`` has twice 8 bits; empty for other formats."""
-    return image.tile[0][3] if image.format == "PNG" else ""
 
 
 def is_adobe_rgb(exif: Image.Exif) -> bool:
@@ -100,20 +95,22 @@ def open_usual(path: Path) -> Iterator[Opened]:
     with opened(path) as image:
         # A PNG's own getexif would decode the whole picture.
         exif = Image.Image.getexif(image)
-        orientation = exif.get(ExifTags.Base.Orientation, UPRIGHT)
-        deep, grey = raw_mode(image).endswith("16B"), image.mode in GREY
+        orientation = exif.get(ExifTags.Base.Orientation, UPRIGHT_ORIENTATION)
+        # Pillow unpacks only the upper byte of twice 8 bits.
+        deep, grey = image.format == "PNG" and image.tile[0][3].endswith("16B"), image.mode in GREY_MODES
         profile = image.info.get("icc_profile")
         colours = foreign(profile, grey, deep) or png_colours(image) or heif_colours(image)
         if not profile and is_adobe_rgb(exif):
             colours = "Adobe RGB by its EXIF"
-        header = shown(image.height, image.width, image.has_transparency_data, deep, orientation)
-        told = exif.get_ifd(ExifTags.IFD.Exif)
-        header = header._replace(exposure=exposure_of(told), colours=colours, lens=lens_of(exif, told))
+        header = upright_header(image.height, image.width, image.has_transparency_data, deep, orientation)
+        camera_tags = exif.get_ifd(ExifTags.IFD.Exif)
+        header = header._replace(exposure=exposure_of(camera_tags), colours=colours, lens=lens_of(exif, camera_tags))
 
         def pixels() -> Tensor:
             gamma = None if colours else png_gamma(image)
             if deep:
-                stored = read_16_bits(image, path)
+                with opened_file(path) as file:
+                    stored = colored(numbers(file))
             else:
                 stored = as_srgb(np.array(image.convert("RGBA" if header.alpha else "RGB")), profile, grey)
             levels = float(np.iinfo(stored.dtype).max)
@@ -125,35 +122,11 @@ def open_usual(path: Path) -> Iterator[Opened]:
         yield Opened(header, pixels)
 
 
-def read_16_bits(image: Image.Image, path: Path) -> UInt16[np.ndarray, "h w c"]:
-    """A PNG of 16 bits a channel, as stored; its one transparent colour, where it names one, becomes alpha.
-
-    Pillow has no colour of 16 bits, but unpacks either byte of it: the upper one of big-endian samples, and the lower
-    one when asked to read them as little-endian.
-    """
-    mode, transparent = raw_mode(image), image.info.get("transparency")
-    if mode == "I;16B":
-        pixels = np.asarray(image).astype(np.uint16)[..., None].repeat(3, axis=-1)
-    elif mode == "LA;16B":
-        image.tile = [(*image.tile[0][:3], "RGBA")]
-        grey, alpha = np.moveaxis(np.asarray(image).view(">u2").astype(np.uint16), -1, 0)
-        return np.stack([grey, grey, grey, alpha], axis=-1)
-    else:
-        with Image.open(path, formats=FORMATS) as other:
-            other.tile = [(*other.tile[0][:3], mode.replace("16B", "16L"))]
-            pixels = np.asarray(image).astype(np.uint16) << 8 | np.asarray(other)
-    if transparent is None:
-        return pixels
-    alpha = np.where((pixels == np.array(transparent)).all(-1, keepdims=True), 0, 65535)
-    return np.concatenate([pixels, alpha.astype(np.uint16)], axis=-1)
-
-
 DECODERS: dict[str, Decoder] = {
-    **dict.fromkeys((".png", ".jpg", ".jpeg", ".webp", *PHONES), open_usual),
-    **dict.fromkeys((".tif", ".tiff"), open_tiff),
-    ".exr": open_exr,
+    **dict.fromkeys((".png", ".jpg", ".jpeg", ".webp", *PHONE_SUFFIXES), open_usual),
+    **dict.fromkeys((".tif", ".tiff", ".exr"), open_deep),
 }
-"""What opens a picture, by its suffix; any other is looked at as if it were one of the first."""
+"""Decoder of a picture by its suffix; other suffixes are tried as the first."""
 
 
 def open_picture(path: Path) -> AbstractContextManager[Opened]:
@@ -162,8 +135,8 @@ def open_picture(path: Path) -> AbstractContextManager[Opened]:
 
 
 @dataclass(frozen=True)
-class Picture:
-    """A picture's file, whose header has been read, and whose pixels are when they are asked for.
+class PictureFile:
+    """A picture's file: the header is read, pixels are decoded when asked for.
 
     Attributes:
         path: the file.
@@ -175,7 +148,7 @@ class Picture:
     header: Header
     decode: Decoder = open_picture
 
-    def as_stored(self) -> Picture:
+    def as_stored(self) -> PictureFile:
         """The same without EXIF's turn."""
         return replace(self, header=self.header.as_stored())
 
@@ -189,10 +162,10 @@ class Picture:
         return torch.from_numpy(np.ascontiguousarray(turned))
 
 
-def read_picture(path: Path, decode: Decoder = open_picture) -> Picture:
+def read_picture(path: Path, decode: Decoder = open_picture) -> PictureFile:
     """Read a picture's header, without decoding it."""
     with decode(path) as (header, _):
-        return Picture(path, header, decode)
+        return PictureFile(path, header, decode)
 
 
 def read_image(path: Path) -> Float32[Tensor, "h w c"]:

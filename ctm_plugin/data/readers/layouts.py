@@ -7,24 +7,26 @@ from contextlib import suppress
 from difflib import get_close_matches
 from pathlib import Path
 
-from ctm_plugin.data.readers.clip import CLIPS
-from ctm_plugin.data.readers.folders import is_picture, refuse_links, require_folder, told
+from ctm_plugin.data.readers.clip import CLIP_SUFFIXES
+from ctm_plugin.data.readers.folders import is_picture, require_folder, told
 from ctm_plugin.data.readers.frames import angle_alone
 from ctm_plugin.errors import DataError
 
 TRANSFORMS, TRAIN, TEST, VAL = (f"transforms{split}.json" for split in ("", "_train", "_test", "_val"))
-POSES = "poses_bounds.npy"
-MODELS = ("sparse/0", "sparse", "colmap/sparse/0", "colmap_sparse/0", "colmap_text")
-"""Where COLMAP's model may lie; else in another of ``sparse``. The third is nerfstudio's, the last instant-ngp's."""
-EXPECTED = {
+LLFF_FILE = "poses_bounds.npy"
+"""Name of LLFF's file of cameras."""
+MODEL_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0", "colmap_sparse/0", "colmap_text")
+"""Folders where COLMAP's model may lie, before other folders of ``sparse`` are tried. The third is nerfstudio's, the
+last instant-ngp's."""
+LAYOUT_EXPECTED = {
     "blender": f"a folder with {TRAIN} and {TEST}",
     "transforms": f"a folder with {TRANSFORMS}, or {TRAIN} and {TEST}",
     "colmap": "a folder with sparse/0 and images",
-    "llff": f"a folder with {POSES} and images",
-    "rawnerf": f"a folder with {POSES} and images or raw",
+    "llff": f"a folder with {LLFF_FILE} and images",
+    "rawnerf": f"a folder with {LLFF_FILE} and images or raw",
 }
 
-FOREIGN = (
+FOREIGN_CAPTURES = (
     ("keyframes/cameras", b"", "Polycam's cameras", "polycam --data {root}"),
     ("metadata.json", b"", "Record3D's cameras", "record3d --data {root}"),
     ("EXR_RGBD/metadata.json", b"", "Record3D's cameras", "record3d --data {root}"),
@@ -33,26 +35,23 @@ FOREIGN = (
     ("opensfm/reconstruction.json", b"", "OpenDroneMap's cameras", "odm --data {root}"),
     ("odm_report/shots.geojson", b"", "OpenDroneMap's cameras", "odm --data {root}"),
 )
-"""What other programs leave: a file's name, what stands at its beginning, whose it is, and the arguments with which
-ns-process-data turns it into a transforms.json."""
+"""Captures of other programs: a file's name, its first bytes, whose it is, and the arguments with which ns-process-data
+turns it into a transforms.json."""
 
 
-def open_layout(root: str | Path, layout: str, links: bool) -> Path:
-    """Open the folder of a data set of this layout, without links to what lies outside it unless ``links``."""
+def open_layout(root: str | Path, layout: str) -> Path:
+    """Open the folder of a data set of this layout."""
     with suppress(OSError, ValueError, RuntimeError):  # what cannot be a path is refused below
         path = Path(root).expanduser()
         if path.is_file() and layouts(path.parent):
             raise DataError(path, "a file", f"its folder, dataset.root={shlex.quote(str(path.parent))}")
-    root = require_folder(root, EXPECTED[layout])
-    if not links:
-        refuse_links(root)
+    expected = LAYOUT_EXPECTED.get(layout, "the folder of a data set")
+    root = require_folder(root, expected)
     fitting = layouts(root)
-    if fitting and layout not in fitting:
-        raise DataError(
-            root, "files of another layout", f"{EXPECTED[layout]}; dataset={fitting[0]} reads what is there"
-        )
-    if not fitting and (hint := way_out(root)):
-        raise DataError(root, "no cameras", f"{EXPECTED[layout]}; {hint}")
+    if layout in LAYOUT_EXPECTED and fitting and layout not in fitting:
+        raise DataError(root, "files of another layout", f"{expected}; dataset={fitting[0]} reads what is there")
+    if layout in LAYOUT_EXPECTED and not fitting and (hint := way_out(root)):
+        raise DataError(root, "no cameras", f"{expected}; {hint}")
     return root
 
 
@@ -69,25 +68,25 @@ def way_out(root: Path) -> str:
         home = root.absolute()
         for path in (*inner, *home.parents[:3]):
             with suppress(OSError):  # what lies around is not ours
-                found = layouts(path)
-                if found == ["colmap"] and path in inner and not any(map(is_picture, path.glob("*/*"))):
+                names = layouts(path)
+                if names == ["colmap"] and path in inner and not any(map(is_picture, path.glob("*/*"))):
                     return f"{path} has them without pictures: move its folder sparse to {quoted}"
-                if found:
-                    return f"{path} has them: dataset={found[0]} dataset.root={shlex.quote(str(path))}"
+                if names:
+                    return f"{path} has them: dataset={names[0]} dataset.root={shlex.quote(str(path))}"
         if any((root / f"cameras{suffix}").exists() for suffix in (".bin", ".txt")):
             return "COLMAP's files are to lie in a folder sparse there, the pictures in images"
         return of_photographs(root)
 
 
 def foreign(root: Path) -> str:
-    """Say whose cameras lie in a folder, and what turns them into a ``transforms.json``, see ``FOREIGN``."""
-    for pattern, start, whose, converter in FOREIGN:
+    """Say whose cameras lie in a folder, and what turns them into a ``transforms.json``, see ``FOREIGN_CAPTURES``."""
+    for pattern, start, whose, converter in FOREIGN_CAPTURES:
         for path in sorted(root.glob(pattern)):
             if not start or (path.is_file() and start in path.read_bytes()[:1000]):
                 quoted = converter.format(root=shlex.quote(str(root)), name=shlex.quote(str(path)))
                 command = f"ns-process-data {quoted} --output-dir capture"
-                told = f"{whose}, {path.relative_to(root)}, are not read"
-                return f"{told}: {command}, of nerfstudio's, writes a {TRANSFORMS} of them"
+                hints = f"{whose}, {path.relative_to(root)}, are not read"
+                return f"{hints}: {command}, of nerfstudio's, writes a {TRANSFORMS} of them"
     return ""
 
 
@@ -102,27 +101,27 @@ def of_photographs(root: Path) -> str:
         name = "images" if "images" in homes else homes[0]
         folder = "" if name == "images" else f" pictures={shlex.quote(name)}"
         return f"ctm cameras {quoted}{folder} finds those of the photographs in {name}, for dataset=colmap"
-    if clips := sorted(path.name for path in root.iterdir() if path.suffix.lower() in CLIPS):
+    if clips := sorted(path.name for path in root.iterdir() if path.suffix.lower() in CLIP_SUFFIXES):
         return f"ctm cameras {quoted} finds those of the frames of {clips[0]}, for dataset=colmap"
     return ""
 
 
 def layouts(root: Path) -> list[str]:
     """List the layouts that a folder has files of, the one that fits best first."""
-    found = []
+    names = []
     if (root / TRANSFORMS).exists():
-        found.append("transforms")
+        names.append("transforms")
     if (root / TRAIN).exists() and (root / TEST).exists():
-        found += ["blender", "transforms"] if angle_alone(root / TRAIN) else ["transforms", "blender"]
+        names += ["blender", "transforms"] if angle_alone(root / TRAIN) else ["transforms", "blender"]
     if any((root / name).exists() for name in (TRAIN, TEST, VAL)):
-        found.append("transforms")
+        names.append("transforms")
     if model_folder(root):
-        found.append("colmap")
-    if (root / POSES).exists():
+        names.append("colmap")
+    if (root / LLFF_FILE).exists():
         if not (root / "raw").is_dir() or (root / "images").is_dir():
-            found.append("llff")
-        found += ["rawnerf", "llff"] if any(root.glob("images*")) else ["rawnerf"]
-    return list(dict.fromkeys(found))
+            names.append("llff")
+        names += ["rawnerf", "llff"] if any(root.glob("images*")) else ["rawnerf"]
+    return list(dict.fromkeys(names))
 
 
 def model_folder(root: Path) -> Path | None:
@@ -132,5 +131,5 @@ def model_folder(root: Path) -> Path | None:
 
 def model_folders(root: Path) -> list[Path]:
     """List where COLMAP's models lie, the one that is taken first."""
-    folders = dict.fromkeys([*(root / name for name in MODELS), *sorted(root.glob("*sparse/[0-9]*"))])
+    folders = dict.fromkeys([*(root / name for name in MODEL_FOLDERS), *sorted(root.glob("*sparse/[0-9]*"))])
     return [each for each in folders if any((each / f"cameras.{kind}").exists() for kind in ("bin", "txt"))]

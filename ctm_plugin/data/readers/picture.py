@@ -18,10 +18,9 @@ from ctm_plugin.color.srgb import linear_to_srgb
 from ctm_plugin.errors import DataError
 
 MAX_PIXELS = 64_000_000
-"""Pixels of the largest picture that is decoded, which takes 15 bytes for each: a small file can claim to hold far more
-than memory does."""
-UPRIGHT = 1
-"""EXIF's orientation of a picture that is stored as it is shown."""
+"""Most pixels of a picture that is decoded, at 15 bytes each: a small file can claim more than memory holds."""
+UPRIGHT_ORIENTATION = 1
+"""EXIF's orientation of a picture that is stored upright."""
 
 
 class Lens(NamedTuple):
@@ -58,7 +57,7 @@ class Header(NamedTuple):
     width: int
     alpha: bool
     deep: bool = False
-    orientation: int = UPRIGHT
+    orientation: int = UPRIGHT_ORIENTATION
     exposure: float | None = None
     colours: str | None = None
     lens: Lens = Lens()
@@ -66,7 +65,7 @@ class Header(NamedTuple):
     def as_stored(self) -> Header:
         """The header of the same picture without EXIF's turn."""
         height, width = (self.width, self.height) if self.orientation > 4 else (self.height, self.width)
-        return self._replace(height=height, width=width, orientation=UPRIGHT)
+        return self._replace(height=height, width=width, orientation=UPRIGHT_ORIENTATION)
 
 
 class Opened(NamedTuple):
@@ -83,7 +82,7 @@ class Opened(NamedTuple):
 
 
 Decoder = Callable[[Path], AbstractContextManager[Opened]]
-"""Opens pictures of one kind; what is wrong with them is a :class:`DataError`, inside the ``with`` too."""
+"""Opens pictures of one format; every fault of a file is a :class:`DataError`, inside the ``with`` too."""
 
 
 def check_size(path: Path, width: int, height: int, expected: str) -> None:
@@ -92,9 +91,9 @@ def check_size(path: Path, width: int, height: int, expected: str) -> None:
         raise DataError(path, f"an image of {width}x{height} pixels", expected)
 
 
-def shown(height: int, width: int, alpha: bool, deep: bool, orientation: int) -> Header:
+def upright_header(height: int, width: int, alpha: bool, deep: bool, orientation: int) -> Header:
     """The header of a picture that is stored in this size; orientations that EXIF does not know count as none."""
-    orientation = orientation if 1 <= orientation <= 8 else UPRIGHT
+    orientation = orientation if 1 <= orientation <= 8 else UPRIGHT_ORIENTATION
     return Header(*((width, height) if orientation > 4 else (height, width)), alpha, deep, orientation)
 
 

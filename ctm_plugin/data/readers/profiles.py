@@ -13,12 +13,12 @@ from PIL import Image, ImageCms
 
 from ctm_plugin.color.srgb import linear_to_srgb
 
-ALIKE = 2
-"""Levels of 255 by which a profile's colours may differ from sRGB's to count as them."""
-SRGB = (1, 13)
-"""cICP's primaries and transfer of sRGB."""
-USUAL = ((1, 2, 5, 6), (1, 2, 6, 13))
-"""Primaries and transfers of NCLX, numbered as in cICP, that pass for sRGB's."""
+PROFILE_TOLERANCE = 2
+"""Largest difference from sRGB, in levels of 255, of a profile that counts as sRGB."""
+SRGB_CICP = (1, 13)
+"""cICP's numbers of sRGB's primaries and transfer."""
+SRGB_NCLX = ((1, 2, 5, 6), (1, 2, 6, 13))
+"""Numbers of primaries and of transfers in NCLX that pass for sRGB's."""
 
 
 class Profile(NamedTuple):
@@ -47,10 +47,10 @@ def read_profile(content: bytes) -> Profile | None:
         return None
     codes = np.arange(0, 256, 15 if mode == "RGB" else 1, dtype=np.uint8)
     codes = np.stack(np.meshgrid(codes, codes, codes), -1).reshape(len(codes), -1, 3) if mode == "RGB" else codes[None]
-    found = np.asarray(ImageCms.applyTransform(Image.fromarray(codes), to_srgb)).astype(int)
+    converted = np.asarray(ImageCms.applyTransform(Image.fromarray(codes), to_srgb)).astype(int)
     codes = codes if mode == "RGB" else codes[..., None]
     light = linear_to_srgb(torch.from_numpy(codes / 255)).numpy() * 255
-    return Profile(mode, to_srgb, *(int(np.abs(found - each).max().round()) for each in (codes, light)))
+    return Profile(mode, to_srgb, *(int(np.abs(converted - each).max().round()) for each in (codes, light)))
 
 
 def as_srgb(pixels: UInt8[np.ndarray, "h w c"], content: bytes | None, grey: bool) -> UInt8[np.ndarray, "h w d"]:
@@ -59,7 +59,7 @@ def as_srgb(pixels: UInt8[np.ndarray, "h w c"], content: bytes | None, grey: boo
     Without a profile, or with one of sRGB, nothing is done, as where :func:`foreign` tells of it.
     """
     profile = read_profile(content) if content else None
-    if profile is None or profile.off <= ALIKE or (profile.mode == "L" and not grey):
+    if profile is None or profile.off <= PROFILE_TOLERANCE or (profile.mode == "L" and not grey):
         return pixels
     colour = Image.fromarray(np.ascontiguousarray(pixels[..., 0] if profile.mode == "L" else pixels[..., :3]))
     alpha = pixels[..., pixels.shape[-1] - 1 + pixels.shape[-1] % 2 :]
@@ -77,7 +77,7 @@ def foreign(content: bytes | None, grey: bool, deep: bool, light: bool = False) 
     if profile is None or (profile.mode == "L" and not grey):
         return "an ICC profile that cannot be used"
     off = profile.off_as_light if light else profile.off
-    return "an ICC profile other than sRGB's, at more than 8 bits" if deep and off > ALIKE else None
+    return "an ICC profile other than sRGB's, at more than 8 bits" if deep and off > PROFILE_TOLERANCE else None
 
 
 def png_gamma(image: Image.Image) -> float | None:
@@ -96,8 +96,8 @@ def png_colours(image: Image.Image) -> str | None:
     head = image.fp.read(image.tile[0][2])
     image.fp.seek(at)
     at = head.find(b"\0\0\0\4cICP") + 8
-    found = tuple(head[at : at + 2])
-    return None if at < 8 or found == SRGB else f"cICP's primaries {found[0]} and transfer {found[1]}"
+    cicp = tuple(head[at : at + 2])
+    return None if at < 8 or cicp == SRGB_CICP else f"cICP's primaries {cicp[0]} and transfer {cicp[1]}"
 
 
 def heif_colours(image: Image.Image) -> str | None:
@@ -105,6 +105,6 @@ def heif_colours(image: Image.Image) -> str | None:
     nclx = image.info.get("nclx_profile")
     if not nclx or image.info.get("icc_profile"):
         return None
-    found = nclx["color_primaries"], nclx["transfer_characteristics"]
-    usual = all(number in known for number, known in zip(found, USUAL, strict=True))
-    return None if usual else f"NCLX's primaries {found[0]:d} and transfer {found[1]:d}"
+    numbers = nclx["color_primaries"], nclx["transfer_characteristics"]
+    usual = all(number in known for number, known in zip(numbers, SRGB_NCLX, strict=True))
+    return None if usual else f"NCLX's primaries {numbers[0]:d} and transfer {numbers[1]:d}"

@@ -5,13 +5,14 @@ from __future__ import annotations
 import json
 import reprlib
 from collections.abc import Callable
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float64
 
-from ctm_plugin.data.readers.folders import inside, read_bytes, told
+from ctm_plugin.data.readers.folders import inside, read_bytes, require_file, told
 from ctm_plugin.errors import DataError
 from ctm_plugin.scene.poses import MAX_COORDINATE
 from ctm_plugin.settings.setting import Number, is_number
@@ -98,7 +99,14 @@ def parse_record(content: bytes, source: Path) -> Record:
 
 
 def read_record(path: Path) -> Record:
-    """The JSON object in a file."""
+    """The JSON object in a file, which is parsed again only where it has changed; it is not to be changed here."""
+    require_file(path, "a JSON file")
+    state = path.stat()
+    return _parsed(path, state.st_mtime_ns, state.st_size)
+
+
+@lru_cache(maxsize=4)
+def _parsed(path: Path, _changed: int, _size: int) -> Record:
     return parse_record(read_bytes(path, "a JSON file"), path)
 
 

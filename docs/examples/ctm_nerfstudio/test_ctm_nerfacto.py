@@ -76,7 +76,7 @@ def auto(scene, tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="session")
 def quick(scene, tmp_path_factory) -> Path:
-    return train(scene, tmp_path_factory.mktemp("quick"), "--pipeline.model.colors", "ctm=quick", "ctm.k=4")
+    return train(scene, tmp_path_factory.mktemp("quick"), "--pipeline.model.colors", "quick", "ctm.k=4")
 
 
 def checkpoint(run: Path, steps: int = STEPS) -> dict:
@@ -144,8 +144,8 @@ def test_metrics_and_pictures_are_of_decoded_colours(run, request, scene, tmp_pa
 
 
 def test_going_on_fits_nothing_anew(quick, scene, tmp_path, monkeypatch):
-    monkeypatch.setattr(model, "prepare", lambda *given: pytest.fail("fitted anew"))
-    more = ("--pipeline.model.colors", "ctm=quick", "ctm.k=4", "--load-dir", str(quick / "nerfstudio_models"))
+    monkeypatch.setattr(model.ctm, "fit", lambda *given, **more: pytest.fail("fitted anew"))
+    more = ("--pipeline.model.colors", "quick", "ctm.k=4", "--load-dir", str(quick / "nerfstudio_models"))
     adam = checkpoint(train(scene, tmp_path, *more, steps=2), STEPS + 2)["optimizers"]["ctm"]
     assert {float(each["step"]) for each in adam["state"].values()} == {1500 + STEPS + 2}
 
@@ -174,11 +174,11 @@ def test_the_renderer_is_nerfstudio_s_where_latents_are_colours(background, trai
 @pytest.mark.parametrize(
     ("colors", "message"),
     [
-        ("backbone=nerf", "pipeline.model.colors: found 'backbone=nerf', expected ctm, color_space, loss, seed or"),
-        ("ctm=qick", "ctm: found 'qick', expected one of "),
-        ("ctm.lr_decay=0.1", "ctm.lr_decay: found 0.1, expected 1 under nerfstudio"),
+        (["auto", "backbone=nerf"], "transform: found 'backbone=nerf', expected settings of the transform"),
+        (["qick"], "transform: found 'qick', expected one of auto"),
+        (["quick", "ctm.lr_decay=0.1"], "ctm.lr_decay: found 0.1, expected 1: your training schedules the optimizer"),
     ],
 )
 def test_mistakes_are_told_before_training(scene, tmp_path, colors, message):
     with pytest.raises(ConfigError, match=message):
-        train(scene, tmp_path, "--pipeline.model.colors", colors)
+        train(scene, tmp_path, "--pipeline.model.colors", *colors)

@@ -25,12 +25,12 @@ class TinyConfig:
 class Tiny(RadianceBackbone):
     Config = TinyConfig
 
-    def __init__(self, config, scene, channels=3, photometric=None, seed=0):
-        super().__init__(scene, config.rays, channels, photometric, seed)
+    def __init__(self, config, scene, transform=None, photometric=None, seed=0):
+        super().__init__(scene, config.rays, transform, photometric, seed)
         self.config, self.total_steps = config, config.steps
         size = 3 * (1 + 2 * config.frequencies)
         hidden = [nn.Linear(size, config.width), nn.ReLU(), nn.Linear(config.width, config.width), nn.ReLU()]
-        self.mlp = nn.Sequential(*hidden, nn.Linear(config.width, channels + 1))
+        self.mlp = nn.Sequential(*hidden, nn.Linear(config.width, self.channels + 1))
 
     def render(self, rays, background, draws):
         near, far, n_rays = self.scene.near, self.scene.far, len(rays.origins)

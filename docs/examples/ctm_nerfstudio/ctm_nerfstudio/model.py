@@ -10,16 +10,7 @@ from nerfstudio.models.nerfacto import NerfactoModel, NerfactoModelConfig
 from nerfstudio.utils.colors import COLORS_DICT
 from torch import Tensor, nn
 
-from ctm_plugin.callbacks.attach_ctm import prepare
-from ctm_plugin.color.photometric import Photometric
-from ctm_plugin.color.transform import ColorTransform
-from ctm_plugin.draws import Draws
-from ctm_plugin.errors import ConfigError
-from ctm_plugin.runs.assemble import color_transform
-from ctm_plugin.runs.compose import compose
-from ctm_plugin.settings.build import build
-
-GROUPS = ("ctm", "color_space", "loss", "seed")
+import ctm_plugin as ctm
 
 
 @dataclass
@@ -27,14 +18,14 @@ class CTMNerfactoConfig(NerfactoModelConfig):
     """Nerfacto's settings, and its colours."""
 
     _target: type = field(default_factory=lambda: CTMNerfacto)
-    colors: tuple[str, ...] = ("ctm=auto",)
-    """What a command line of ctm_plugin says of ctm, color_space and loss: ctm=quick ctm.k=4 loss.weight=3."""
+    colors: tuple[str, ...] = ("auto",)
+    """What ``ctm_plugin.transform`` takes: quick ctm.k=4."""
 
 
 class LatentRenderer(renderers.RGBRenderer):
     """Adds up latents of any number of channels over encoded backgrounds."""
 
-    def __init__(self, background_color: str, transform: ColorTransform):
+    def __init__(self, background_color: str, transform: nn.Module):
         super().__init__(background_color)
         self.held = (transform,)  # in a tuple: the module tree has it already
 
@@ -74,16 +65,12 @@ class LatentRenderer(renderers.RGBRenderer):
 class ColorLoss(nn.Module):
     """A transform's losses in the place of nerfacto's squared difference; ``terms`` has them by name."""
 
-    def __init__(self, transform: ColorTransform, photometric: Photometric):
+    def __init__(self, transform: nn.Module):
         super().__init__()
-        self.held, self.photometric = (transform,), photometric
+        self.held = (transform,)
 
     def forward(self, rgb: Tensor, latent: Tensor) -> Tensor:
-        def uniform(rows: int, channels: int) -> Tensor:
-            return torch.rand(rows, channels, device=rgb.device)
-
-        with torch.autocast(rgb.device.type, enabled=False):
-            self.terms, _ = self.held[0].losses([latent.float()], rgb.float(), self.photometric, uniform)
+        self.terms = ctm.losses(self.held[0], latent, rgb)
         return sum(self.terms.values())
 
 
@@ -94,45 +81,35 @@ class CTMNerfacto(NerfactoModel):
 
     def populate_modules(self) -> None:
         super().populate_modules()
-        for text in self.config.colors:
-            if text.lstrip("+").partition("=")[0].partition(".")[0] not in GROUPS:
-                raise ConfigError("pipeline.model.colors", text, f"{', '.join(GROUPS)} or keys of theirs")
-        settings = compose(*self.config.colors)
-        self.seed = settings["seed"]
-        self.transform, self.transform_training = color_transform(settings, self.seed)
-        if self.transform_training.lr_decay != 1:
-            raise ConfigError("ctm.lr_decay", self.transform_training.lr_decay, "1 under nerfstudio")
+        name, *keys = self.config.colors
+        self.transform = ctm.transform(name.removeprefix("ctm="), *keys)
         head = self.field.mlp_head
         self.field.mlp_head = MLP(
             head.in_dim, head.num_layers, head.layer_width, self.transform.channels,
             activation=head.activation, out_activation=head.out_activation, implementation=self.config.implementation,
         )  # fmt: skip
         self.renderer_rgb = LatentRenderer(self.config.background_color, self.transform)
-        self.rgb_loss = ColorLoss(self.transform, build(Photometric, settings["loss"], "loss"))
+        self.rgb_loss = ColorLoss(self.transform)
 
     def get_param_groups(self) -> dict[str, list]:
         groups = super().get_param_groups()
         if parameters := list(self.transform.parameters()):
-            training = self.transform_training
-            groups["ctm"] = [{"params": parameters, "lr": training.lr, "betas": training.betas}]
+            learning = self.transform.learning
+            groups["ctm"] = [{"params": parameters, "lr": learning.lr, "betas": learning.betas}]
         return groups
 
     def get_training_callbacks(self, attributes: TrainingCallbackAttributes) -> list[TrainingCallback]:
         if attributes.trainer.world_size > 1 and any(True for _ in self.transform.parameters()):
-            raise ConfigError("machine.num_devices", attributes.trainer.world_size, "1 for a transform that learns")
+            found = attributes.trainer.world_size
+            raise ValueError(f"machine.num_devices: found {found}, expected 1 for a transform that learns")
         begin = TrainingCallback([TrainingCallbackLocation.BEFORE_TRAIN_ITERATION], self.begin, args=[attributes])
         return [begin, *super().get_training_callbacks(attributes)]
 
     def begin(self, attributes: TrainingCallbackAttributes, step: int) -> None:
         """Fit the transform to training colours, before the first step of all: a checkpoint has what was found."""
         if step == 0:
-            adam = attributes.optimizers.optimizers.get("ctm")
             pixels = self.training_colors(attributes.pipeline.datamanager, 1 << 15)
-
-            def colors(draws: Draws, count: int) -> Tensor:
-                return pixels[draws.integers(len(pixels), count)]
-
-            prepare(self.transform, self.transform_training, adam, colors, self.seed, self.device)
+            ctm.fit(self.transform, pixels, optimizer=attributes.optimizers.optimizers.get("ctm"))
             if layers := getattr(self.field.mlp_head, "layers", None):  # tcnn's have no biases
                 # The scene's mean: from grey the first steps would drive the sigmoid to where it has no gradient.
                 mean = self.transform.encode(pixels).mean(0).detach()

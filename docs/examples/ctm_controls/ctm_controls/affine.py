@@ -2,16 +2,27 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from ctm_plugin.appearance.exposure import Exposure, Place
-from ctm_plugin.appearance.settings import AffineConfig
+from ctm_plugin.appearance.exposure import Exposure, PixelPlaces
+from ctm_plugin.appearance.settings import ExposureConfig
 from ctm_plugin.scene.views import Views
+from ctm_plugin.settings.setting import setting
 
-LEAST_DETERMINANT = 0.05
-"""Of a matrix that is inverted: flatter ones count as this flat."""
+MIN_DETERMINANT = 0.05
+"""Least absolute determinant of an inverted matrix: flatter ones count as this flat."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class AffineConfig(ExposureConfig):
+    """How far colours may be mixed."""
+
+    lr_colors: float = setting(2e-3, "learning rate of the colour matrices", above=0)
+    identity: float = setting(0.1, "weight of the matrices' mean squared distance from the identity", least=0)
 
 
 class Affine(Exposure):
@@ -34,10 +45,10 @@ class Affine(Exposure):
     def matrices(self) -> Float[Tensor, "n 3 3"]:
         return self.mixes() + torch.eye(3, device=self.mix.device)
 
-    def forward(self, light: Float[Tensor, "r 3"], place: Place) -> Float[Tensor, "r 3"]:
+    def forward(self, light: Float[Tensor, "r 3"], place: PixelPlaces) -> Float[Tensor, "r 3"]:
         return super().forward(mixed(self.matrices().index_select(0, place.view), light), place)
 
-    def undone(self, light: Float[Tensor, "r 3"], place: Place) -> Float[Tensor, "r 3"]:
+    def undone(self, light: Float[Tensor, "r 3"], place: PixelPlaces) -> Float[Tensor, "r 3"]:
         return mixed(inverted(self.matrices()).index_select(0, place.view), super().undone(light, place))
 
     def regularisers(self) -> dict[str, Tensor]:
@@ -58,4 +69,4 @@ def inverted(matrices: Float[Tensor, "n 3 3"]) -> Float[Tensor, "n 3 3"]:
     """
     a, b, c = matrices.unbind(-2)
     columns = torch.stack([torch.linalg.cross(b, c), torch.linalg.cross(c, a), torch.linalg.cross(a, b)], dim=-1)
-    return columns / (a * columns[..., 0]).sum(-1).clamp(min=LEAST_DETERMINANT)[..., None, None]
+    return columns / (a * columns[..., 0]).sum(-1).clamp(min=MIN_DETERMINANT)[..., None, None]
