@@ -107,7 +107,7 @@ def found(dark, tmp_path_factory) -> subprocess.CompletedProcess:
 def test_the_cameras_are_those_that_took_the_pictures(dark, found):
     assert found.returncode == 0, found.stderr
     poses, focal = COMPARE["read"](dark)
-    names = [Path(name).name for name in NAMES]
+    names = [Path(name).stem for name in NAMES]
     assert sorted(poses) == sorted(names)
     centre, turn, _ = COMPARE["errors"](np.stack([poses[name] for name in names]), POSES[:, :3])
     assert centre.max() < 0.01
@@ -192,7 +192,7 @@ def test_two_lenses_and_upright_pictures_have_a_camera_each(tmp_path):
     assert done.returncode == 0, done.stderr
     assert len(re.findall(r"focal length +\d+\.\d pixels of (176x132|132x176), in \d pictures", done.stdout)) == 4
     poses, _ = COMPARE["read"](tmp_path)
-    centre, turn, _ = COMPARE["errors"](np.stack([poses[Path(name).name] for name in NAMES]), POSES[:, :3])
+    centre, turn, _ = COMPARE["errors"](np.stack([poses[Path(name).stem] for name in NAMES]), POSES[:, :3])
     assert centre.max() < 0.01
     assert turn.max() < 1
     with pytest.warns(UserWarning, match="pictures of 2 sizes"):
@@ -214,7 +214,7 @@ def test_two_lenses_that_nothing_tells_have_a_camera_each(tmp_path):
     lengths = re.findall(r"focal length +(\d+\.\d) pixels of 176x132, in [45] pictures", done.stdout)
     assert sorted(map(float, lengths)) == pytest.approx(focal, rel=0.03)
     poses, _ = COMPARE["read"](tmp_path)
-    centre, _, _ = COMPARE["errors"](np.stack([poses[Path(name).name] for name in NAMES]), POSES[:, :3])
+    centre, _, _ = COMPARE["errors"](np.stack([poses[Path(name).stem] for name in NAMES]), POSES[:, :3])
     assert centre.max() < 0.02
 
 
