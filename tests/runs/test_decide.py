@@ -75,6 +75,7 @@ def test_splats_stay_on_the_processor_where_a_gpu_has_nothing_to_composite_them_
 def test_what_it_read_is_not_read_again(request, small, untrained, monkeypatch, scene, records):
     """From a folder to the first step: a file with cameras, and a picture's header and its pixels, once each."""
     root, times = request.getfixturevalue(scene), Counter()
+    reading._parsed.cache_clear()  # of other tests of this folder
 
     def counted(module, name):
         own = getattr(module, name)
