@@ -106,7 +106,7 @@ VERBS = {
     ),
     "cameras": Verb(
         "find the cameras of photographs with COLMAP", "FOLDER", "ctm_plugin.cameras.command:cameras",
-        "ctm_plugin.cameras.settings:CamerasConfig",
+        "ctm_plugin.cameras.settings:CamerasConfig", goes_on=True,
     ),
 }  # fmt: skip
 VERBS_OF_OTHERS = Registry("command", "ctm_plugin.verbs", {})
