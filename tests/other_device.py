@@ -52,7 +52,7 @@ SETTINGS = {
 }
 BRIEF = ("ctm=quick", "ctm.pretrain_steps=3", "trainer.log_every=5", "trainer.image_every=10")
 # Samples of each ray, those outside free space, those with alpha, those with weight.
-PACKED = ["_local_scalar_dense in pack_samples", "nonzero in occupied_samples", *["nonzero in choose"] * 2]
+PACKED = ["_local_scalar_dense in pack_samples", "nonzero in occupied_samples", *["nonzero in forward"] * 2]
 STEP_WAITS = {
     "dvgo": PACKED,
     "dvgo, forward": PACKED,
