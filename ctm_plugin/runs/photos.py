@@ -143,12 +143,16 @@ def choices(root: Path, minutes: float, others: Sequence[str], say: Callable[[st
     """Choose the layout, the pictures' width and the budget, and say so; what is given stays."""
     import torch
 
+    from ctm_plugin.cameras.exposures import UNEVEN, spread_of_gains
     from ctm_plugin.runs.assemble import assemble
     from ctm_plugin.runs.plan import REFERENCE, TIMED_COLUMNS, plan, timed_steps
 
     layout = layouts(root)[0]
     chosen = {"dataset": layout, "dataset.root": root.resolve(), "ctm": "auto"}
     given = {other.partition("=")[0].lstrip("+") for other in others}
+    if not any(key.startswith("appearance") for key in given) and (spread := spread_of_gains(root)) > UNEVEN:
+        chosen["appearance"] = "exposure"
+        say(f"appearance=exposure: the photographs' exposures spread by {spread:.0%}")
     config = compose(*_overrides(chosen, given), "trainer=smoke", *others)
     dataset = {key: value for key, value in config["dataset"].items() if key != "name"}
     rig = build(DATASETS.get(layout), dataset, "dataset").rig()

@@ -93,7 +93,7 @@ VERBS = {
         "ctm_plugin.view.settings:ViewConfig",
     ),
     "report": Verb(
-        "make tables and figures of finished runs, with the paper's values", "RUNS ...",
+        "make tables of finished runs, with the paper's values", "RUNS ...",
         "ctm_plugin.report.command:report", "ctm_plugin.report.settings:ReportConfig",
     ),
     "list": Verb(
@@ -106,7 +106,7 @@ VERBS = {
     ),
     "cameras": Verb(
         "find the cameras of photographs with COLMAP", "FOLDER", "ctm_plugin.cameras.command:cameras",
-        "ctm_plugin.cameras.settings:CamerasConfig",
+        "ctm_plugin.cameras.settings:CamerasConfig", goes_on=True,
     ),
 }  # fmt: skip
 VERBS_OF_OTHERS = Registry("command", "ctm_plugin.verbs", {})

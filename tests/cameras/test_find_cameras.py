@@ -3,6 +3,7 @@
 import errno
 import re
 import runpy
+import shutil
 import subprocess
 import sys
 from importlib.util import find_spec
@@ -24,12 +25,14 @@ from scipy.spatial.transform import Rotation
 from ctm_plugin import cli
 from ctm_plugin.cameras import command
 from ctm_plugin.cameras.colmap import FILM_DIAGONAL, choose_pairs, focal_length
+from ctm_plugin.cameras.exposures import UNEVEN
 from ctm_plugin.cameras.photographs import home_of, list_photographs
 from ctm_plugin.cameras.trust import Trusted
 from ctm_plugin.color.srgb import linear_to_srgb
 from ctm_plugin.data.colmap import ColmapConfig
 from ctm_plugin.data.readers.colmap_model import mark_as_shown
 from ctm_plugin.data.readers.picture import Header, Lens
+from ctm_plugin.errors import DataError
 
 COMPARE = runpy.run_path(str(Path(__file__).parents[2] / "benchmarks" / "cameras.py"))
 SIZE, ANGLE, COUNT, LIGHT = (176, 132), 0.8, 9, 0.03
@@ -104,7 +107,7 @@ def found(dark, tmp_path_factory) -> subprocess.CompletedProcess:
 def test_the_cameras_are_those_that_took_the_pictures(dark, found):
     assert found.returncode == 0, found.stderr
     poses, focal = COMPARE["read"](dark)
-    names = [Path(name).name for name in NAMES]
+    names = [Path(name).stem for name in NAMES]
     assert sorted(poses) == sorted(names)
     centre, turn, _ = COMPARE["errors"](np.stack([poses[name] for name in names]), POSES[:, :3])
     assert centre.max() < 0.01
@@ -124,6 +127,25 @@ def test_what_is_told(dark, found):
 
 @COLMAP
 @pytest.mark.usefixtures("found")
+def test_stopped_the_same_command_goes_on_to_the_same_cameras(dark, tmp_path):
+    """Stopped when all is matched: details and matches are there, and nothing is left of them in the end."""
+    shutil.copytree(dark / "images", tmp_path / "images")
+    stop = "import sys; from ctm_plugin import cli; from ctm_plugin.cameras.colmap import Workshop\n"
+    stop += "def stopped(*_): raise KeyboardInterrupt\nWorkshop.reconstruct = stopped; sys.exit(cli.main(sys.argv[1:]))"
+    command_line = ["cameras", str(tmp_path), "threads=1"]
+    done = subprocess.run([sys.executable, "-c", stop, *command_line], capture_output=True, text=True)
+    assert done.returncode == 130
+    assert done.stderr.endswith(f"\nstopped; what was done is kept; go on with: ctm {' '.join(command_line)}\n")
+    assert sorted(path.name for path in tmp_path.iterdir()) == [".ctm_cameras", "images"]
+    done = run(tmp_path / "told", tmp_path, "threads=1")
+    assert f"details: {COUNT} of {COUNT}, {COUNT} of them before, " in done.stderr
+    assert not (tmp_path / ".ctm_cameras").exists()
+    for name in ("cameras.bin", "images.bin"):
+        assert (tmp_path / "sparse/0" / name).read_bytes() == (dark / "sparse/0" / name).read_bytes()
+
+
+@COLMAP
+@pytest.mark.usefixtures("found")
 def test_the_folder_is_read_afterwards(dark):
     scene = ColmapConfig(root=dark).load()
     assert len(scene.train) + len(scene.test) == COUNT
@@ -131,6 +153,26 @@ def test_the_folder_is_read_afterwards(dark):
     assert 0 < scene.near < scene.far
     stored = iio.imread(dark / "images" / TURNED, plugin="pillow")
     np.testing.assert_array_equal(scene.train.images[scene.train.names.index("corner 4")], stored[::-1, ::-1])
+
+
+def spread_of(root: Path) -> float:
+    """In a process of its own, too."""
+    code = "import sys; from ctm_plugin.cameras import exposures as e; print(e.spread_of_gains(e.Path(sys.argv[1])))"
+    return float(subprocess.run([sys.executable, "-c", code, root], capture_output=True, text=True, check=True).stdout)
+
+
+@COLMAP
+@pytest.mark.usefixtures("found")
+def test_uneven_exposures_are_seen_in_the_points(dark, tmp_path):
+    """The same capture with every second picture a third brighter; as it is, exposures are even."""
+    assert spread_of(dark) < 0.5 * UNEVEN
+    uneven = shutil.copytree(dark, tmp_path / "uneven")
+    walls = painted()
+    for number, (name, pose) in enumerate(zip(NAMES, POSES, strict=True)):
+        if number % 2 and name != TURNED:
+            iio.imwrite(uneven / "images" / name, photograph(corner(pose, walls) * LIGHT * 4 / 3))
+    bright = np.array([number % 2 and name != TURNED for number, name in enumerate(NAMES)])
+    assert spread_of(uneven) == pytest.approx(np.std(bright * np.log(4 / 3)), rel=0.1)
 
 
 @COLMAP
@@ -150,13 +192,30 @@ def test_two_lenses_and_upright_pictures_have_a_camera_each(tmp_path):
     assert done.returncode == 0, done.stderr
     assert len(re.findall(r"focal length +\d+\.\d pixels of (176x132|132x176), in \d pictures", done.stdout)) == 4
     poses, _ = COMPARE["read"](tmp_path)
-    centre, turn, _ = COMPARE["errors"](np.stack([poses[Path(name).name] for name in NAMES]), POSES[:, :3])
+    centre, turn, _ = COMPARE["errors"](np.stack([poses[Path(name).stem] for name in NAMES]), POSES[:, :3])
     assert centre.max() < 0.01
     assert turn.max() < 1
     with pytest.warns(UserWarning, match="pictures of 2 sizes"):
         scene = ColmapConfig(root=tmp_path).load()
     found = {f"{name}.png": each for name, each in zip(scene.train.names, scene.train.intrinsics[:, 0], strict=True)}
     assert {name: float(each) for name, each in found.items()} == pytest.approx({n: focal[n] for n in found}, rel=0.02)
+
+
+@COLMAP
+def test_two_lenses_that_nothing_tells_have_a_camera_each(tmp_path):
+    """Pictures of one size without EXIF, every second one zoomed in."""
+    (tmp_path / "images" / "more").mkdir(parents=True)
+    walls, focal = painted(), (FOCAL, 1.5 * FOCAL)
+    for number, (name, pose) in enumerate(zip(NAMES, POSES, strict=True)):
+        Image.fromarray(photograph(corner(pose, walls, SIZE, focal[number % 2]))).save(tmp_path / "images" / name)
+    done = run(tmp_path / "told", tmp_path, "threads=1")
+    assert done.returncode == 0, done.stderr
+    assert "2 lenses without EXIF, of " in done.stderr
+    lengths = re.findall(r"focal length +(\d+\.\d) pixels of 176x132, in [45] pictures", done.stdout)
+    assert sorted(map(float, lengths)) == pytest.approx(focal, rel=0.03)
+    poses, _ = COMPARE["read"](tmp_path)
+    centre, _, _ = COMPARE["errors"](np.stack([poses[Path(name).stem] for name in NAMES]), POSES[:, :3])
+    assert centre.max() < 0.02
 
 
 @COLMAP
@@ -295,15 +354,26 @@ def test_cameras_that_are_there_are_kept(three, refused, name):
     assert (three / name).read_bytes() == b"before"
 
 
-def test_an_interrupt_leaves_nothing(three, monkeypatch, capsys):
-    def stopped(*_: object) -> None:
+def test_what_was_done_before_an_interrupt_is_for_the_same_search(three, monkeypatch, capsys):
+    """And nothing else stays; when it fails, not even that."""
+    begun = []
+
+    def stopped(*given: object) -> None:
         assert any((three / "sparse").iterdir())
-        raise KeyboardInterrupt
+        begun.append((given[-1] / "details").exists())
+        (given[-1] / "details").touch()
+        raise KeyboardInterrupt if len(begun) < 4 else DataError(three, "nothing", "something")
 
     monkeypatch.setattr(command, "require_pycolmap", lambda: None)
     monkeypatch.setattr(command, "find_cameras", stopped)
-    assert cli.main(["cameras", str(three)]) == 130
-    assert capsys.readouterr().err == "stopped; nothing was written\n"
+    for more in ([], ["threads=1"], ["size=100"]):
+        assert cli.main(["cameras", str(three), *more]) == 130
+        told = f"stopped; what was done is kept; go on with: ctm cameras {' '.join([str(three), *more])}\n"
+        assert capsys.readouterr().err == told
+        assert sorted(path.name for path in three.iterdir()) == [".ctm_cameras", "images"]
+    iio.imwrite(three / "images" / "c.png", np.full((6, 8, 3), 99, dtype=np.uint8))
+    assert cli.main(["cameras", str(three), "size=100"]) == 1
+    assert begun == [False, True, False, False]
     assert [path.name for path in three.iterdir()] == ["images"]
 
 

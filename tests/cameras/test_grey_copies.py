@@ -7,9 +7,8 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ctm_plugin.cameras.search import find_gain, read_grey
+from ctm_plugin.cameras.search import as_grey, find_gain, read_light
 from ctm_plugin.color.light import TARGET_MEAN, brighten
-from ctm_plugin.color.srgb import linear_to_srgb
 from ctm_plugin.data.readers.images import read_picture
 
 
@@ -17,21 +16,20 @@ def test_light_is_averaged_and_not_its_code(tmp_path):
     """Black and white columns are half the light, whose code is 188, not 128."""
     path = tmp_path / "stripes.png"
     iio.imwrite(path, np.tile(np.array([0, 255], dtype=np.uint8)[:, None], (4, 2, 3)).reshape(4, 4, 3))
-    torch.testing.assert_close(read_grey(read_picture(path), 2)[0] * 255, torch.full((2, 2), 187.5), atol=0.1, rtol=0)
+    grey = as_grey(read_light(read_picture(path), 2).light)
+    torch.testing.assert_close(grey * 255, torch.full((2, 2), 187.5), atol=0.1, rtol=0)
 
 
 def test_primaries_weigh_as_the_eye_sees_them(tmp_path):
     path = tmp_path / "primaries.png"
     iio.imwrite(path, (np.eye(3) * 255).astype(np.uint8)[None])
-    torch.testing.assert_close(
-        read_grey(read_picture(path), 3)[0], linear_to_srgb(torch.tensor([[0.2126, 0.7152, 0.0722]]))
-    )
+    torch.testing.assert_close(read_light(read_picture(path), 3).light, torch.tensor([[0.2126, 0.7152, 0.0722]]))
 
 
 def test_what_no_factor_divides_is_cut(tmp_path):
     iio.imwrite(tmp_path / "odd.png", np.full((7, 11, 3), 255, dtype=np.uint8))
-    grey, factor = read_grey(read_picture(tmp_path / "odd.png"), 4)
-    assert (*grey.shape, factor) == (2, 3, 3)
+    light, scale = read_light(read_picture(tmp_path / "odd.png"), 4)
+    assert (*light.shape, scale) == (2, 3, 3)
 
 
 @given(st.floats(0.01, 0.3), st.integers(0, 99))

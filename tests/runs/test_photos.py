@@ -9,6 +9,7 @@ from PIL import Image
 
 from ctm_plugin.cli import main
 from ctm_plugin.errors import DataError
+from ctm_plugin.runs.photos import choices
 
 SMALL = ("trainer=smoke", "backbone=dvgo", "backbone.steps_alone=3", "backbone.grow=[]", "dataset.exposure=0.05")
 
@@ -92,6 +93,18 @@ def test_photographs_that_were_added_are_searched_anew(capture, monkeypatch, cap
     assert main(["photos", str(capture), *SMALL]) == 1
     assert asked == [True]
     assert "cameras: 1 photographs were added since the search; COLMAP searches" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("spread", "more", "expected"),
+    [(0.3, (), True), (0.04, (), False), (0.3, ("appearance=none",), False), (0.3, ("+appearance=none",), False)],
+)
+def test_uneven_photographs_are_evened_unless_told_otherwise(capture, monkeypatch, spread, more, expected):
+    monkeypatch.setattr("ctm_plugin.cameras.exposures.spread_of_gains", lambda root: spread)
+    said = []
+    chosen = choices(capture, 1.0, [*SMALL, *more], said.append)
+    assert ("appearance=exposure" in chosen) == expected
+    assert ("appearance=exposure: the photographs' exposures spread by 30%" in said) == expected
 
 
 def test_runs_that_cannot_be_written_are_refused_before_cameras_are_searched(tmp_path, monkeypatch, capsys):
