@@ -1,4 +1,4 @@
-"""Lenses of pictures whose EXIF tells none, told apart by the focal length that each picture would like to have."""
+"""Pictures without a focal length in EXIF are grouped by the one that fits each best: a camera for each lens."""
 
 from __future__ import annotations
 
