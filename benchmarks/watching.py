@@ -1,7 +1,8 @@
 """The share of a run's wall clock that goes into what a person sees of it while it trains.
 
 ``python benchmarks/watching.py [+]group=choice key=value ...``, as on the command line of ``ctm_plugin``; the run lies
-in a temporary folder. Every method with which Lightning calls the dashboard, the progress line and the film is timed.
+in a temporary folder. Every method with which Lightning calls the dashboard, the progress line and the film is timed,
+and the validations, whose pictures the dashboard shows.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from collections import Counter
 from functools import wraps
 from pathlib import Path
 
+from ctm_plugin.backbones.base import Backbone
 from ctm_plugin.callbacks.dashboard import Dashboard
 from ctm_plugin.callbacks.film import Film
 from ctm_plugin.callbacks.progress import ProgressLine
@@ -20,10 +22,10 @@ from ctm_plugin.runs.compose import compose
 from ctm_plugin.runs.train import train
 
 
-def timed(kind: type, spent: Counter[str]) -> None:
-    """Count the seconds in all hooks of a callback."""
+def timed(kind: type, spent: Counter[str], hooks: tuple[str, ...] = ("on_", "teardown")) -> None:
+    """Count the seconds in all hooks of a callback, which begin with ``hooks``."""
     for name, method in vars(kind).copy().items():
-        if name.startswith("on_") or name == "teardown":
+        if name.startswith(hooks):
 
             @wraps(method)
             def hook(*args, method=method, **kwargs):
@@ -40,6 +42,7 @@ def main() -> None:
     spent: Counter[str] = Counter()
     for kind in (Dashboard, ProgressLine, Film):
         timed(kind, spent)
+    timed(Backbone, spent, ("validation_step",))
     config = compose(*sys.argv[1:])
     with tempfile.TemporaryDirectory() as folder:
         result = train(config, Path(folder) / "run")

@@ -191,8 +191,7 @@ def _train(arguments: Sequence[str]) -> None:
             own.multirun(name, run, [*overrides, "hydra.mode=MULTIRUN"])
         else:
             config = composed(overrides, name, whole=True)
-            if not elsewhere(ready):
-                check_values(config, ready)
+            check_values(config, ready)
             if flags.cfg:
                 _print_one(own, config, flags)
             else:

@@ -11,7 +11,6 @@ from typing import Any
 import pytest
 from hydra._internal import defaults_list
 from hydra._internal.config_repository import CachingConfigRepository
-from hydra._internal.hydra import Hydra
 from omegaconf import _utils, base, grammar_parser
 from yaml.constructor import SafeConstructor
 from yaml.resolver import Resolver
@@ -24,23 +23,12 @@ except ImportError:  # PyYAML built without libyaml
 
 def quicken(patch: pytest.MonkeyPatch) -> None:
     """Replace what is done twice for as long as ``patch`` lasts."""
-    patch.setattr(Hydra, "get_mode", asked_mode(Hydra.get_mode))
     patch.setattr(CachingConfigRepository, "__init__", share)
     patch.setattr(defaults_list, "_create_interpolation_map", remembered(defaults_list._create_interpolation_map))
     patch.setattr(base, "parse", functools.lru_cache(maxsize=None)(grammar_parser.parse))
     if CParser is not None:
         loader = quick_loader(_utils.get_yaml_loader())
         patch.setattr(_utils, "get_yaml_loader", lambda: loader)
-
-
-def asked_mode(own: Any) -> Any:
-    """Compose for the mode, before it is composed again to run in it, only where one is given: no file of ours does."""
-
-    def get_mode(self: Hydra, config_name: str | None, overrides: list[str]) -> Any:
-        given = any("hydra.mode" in override for override in overrides)
-        return own(self, config_name, overrides) if given else None
-
-    return get_mode
 
 
 def share(self: CachingConfigRepository, delegate: Any) -> None:

@@ -104,6 +104,10 @@ def test_choices_in_a_folder_that_is_not_there(refused):
     assert "--config-dir: found 'nowhere', expected a folder with choices" in refused("-cd", "nowhere")
 
 
+def test_several_values_beside_choices_of_a_folder(tmp_path, refused):
+    assert "seed: found '0,1', expected one value" in refused("-cd", tmp_path, "seed=0,1")
+
+
 def test_arguments_come_from_the_command_line(monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", ["ctm", "+backbone=nerve"])
     assert main() == 1

@@ -76,6 +76,15 @@ def test_docstrings_messages_and_meanings_are_plain(name):
     assert not [text for text in meanings if isinstance(text, str) and len(re.findall(r"\S*\w\S*", text)) > MOST_WORDS]
 
 
+@pytest.mark.parametrize("name", NAMES)
+def test_docstrings_begin_with_what_a_thing_is(name):
+    """None begins with "Of ", those of constants and fields included."""
+    bare = (node.value for node in ast.walk(ast.parse((ROOT / name).read_text())) if isinstance(node, ast.Expr))
+    assert not [
+        ast.unparse(each) for each in bare if isinstance(each, ast.Constant) and str(each.value).startswith("Of ")
+    ]
+
+
 @pytest.mark.parametrize("path", sorted(conf_dir().rglob("*.yaml")), ids=lambda path: f"{path.parent.name}/{path.name}")
 def test_comments_of_choices_are_plain(path):
     assert not [line for line in path.read_text().splitlines() if FOREIGN.search(line.partition("#")[2])]

@@ -16,8 +16,8 @@ WINDOWS = 8
 
 
 def share(count: int, latest: int) -> float:
-    """What of the mean the parameters make up at its look number ``count``: ``max(4 / latest, 9 / (10 + count))``, by
-    which the beginning is soon forgotten."""
+    """Weight of the parameters in the mean at its update number ``count``: ``max(4 / latest, 9 / (10 + count))``, which
+    soon forgets the beginning."""
     return max(min(1.0, STEPS_BETWEEN / latest), 9 / (10 + count))
 
 

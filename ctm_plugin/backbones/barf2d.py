@@ -175,7 +175,7 @@ class BARF2D(Backbone):
 
     @cached_property
     def light(self) -> Light:
-        """What pictures of the scene are shown to people in: found from the patches as trained on."""
+        """Light in which pictures of the scene are displayed, found from the patches as trained on."""
         return find_light(self.scene.patches)
 
     def scores(self, folder: Path | None, scoring: Scoring) -> dict[str, Any]:

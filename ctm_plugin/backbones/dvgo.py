@@ -160,7 +160,7 @@ class DVGO(OccupiedBackbone):
 
     @torch.no_grad()
     def free_what_floats(self) -> None:
-        """Take coarse voxels that few training views see, or that lie close before a camera, for free.
+        """Free coarse voxels that few training views see, or that lie close before a camera: floaters start there.
 
         Nothing contradicts what fills them.
         """
@@ -170,7 +170,7 @@ class DVGO(OccupiedBackbone):
         field.density.data[too_near] = -100.0
 
     def renew_pool(self) -> None:
-        """Draw training pixels from the rays that may meet something, once free space is known.
+        """Draw training pixels from the rays that may meet an occupied voxel, once free space is known.
 
         In front of a forward-facing scene nearly every ray does.
         """
@@ -200,7 +200,7 @@ class DVGO(OccupiedBackbone):
 
     @torch.no_grad()
     def _start_fine(self) -> None:
-        """Build the fine field in a tight box round what the coarse stage found, outside its free space."""
+        """Build the fine field in a tight box round the coarse stage's surface, without its free space."""
         coarse = self.field
         dense = (coarse.alpha() > self.bbox_thre).flatten()
         solid = coarse.dilated_alpha() > self.bbox_thre

@@ -66,7 +66,7 @@ class HashField(OccupiedField):
         return out[:, 0].clamp_max(MAX_LOG_DENSITY).exp(), shade
 
     def log_density(self, points: Tensor) -> Tensor:
-        """Only the density network's first output, ``[M]``, at points ``[M, 3]`` of the space; without gradients."""
+        """Logarithm of the density, ``[M]``, at points ``[M, 3]`` of the space; without gradients."""
         return log_density(*self._looked_up(), self.space.unit(points))
 
     def reached(self, t: Tensor, ray_index: Tensor, points: Tensor, n_rays: int) -> tuple[Tensor, ...]:
@@ -83,7 +83,7 @@ class HashField(OccupiedField):
 
     @torch.no_grad()
     def update_occupancy(self, draws: Draws, share: float) -> None:
-        """Look at random points of a share of the cells, and of as many again out of those not free; at 1 at all cells.
+        """Update alpha at random points of a share of the cells, and of as many occupied ones; at 1 of all cells.
 
         What was known of every cell fades, the larger number stays.
         """
@@ -107,7 +107,7 @@ class HashField(OccupiedField):
 
     @torch.no_grad()
     def settle(self, below: float, rays: Rays, hull: Callable[[Tensor], Tensor]) -> None:
-        """Leave cells free for good that have less alpha, and none of whose neighbours has as much.
+        """Free cells permanently if they and their neighbours are below ``below``.
 
         Not those on ``rays`` of the world that meet none with as much, where ``hull``, of points ``[M, 3]``, is true.
         """
@@ -120,9 +120,7 @@ class HashField(OccupiedField):
         self.met = self.occupancy | (self.allowed & lost)
 
     def on_those_that_miss(self, rays: Rays, cells: Tensor) -> Tensor:
-        """``[V]`` boolean: the cells on those rays of the world that meet none of ``cells``, ``[V]``, and those next to
-        them, as rays lie apart.
-        """
+        """``[V]`` boolean: cells, dilated by one, on those rays of the world that meet none of ``cells`` ``[V]``."""
         hit, everywhere = torch.zeros_like(cells), torch.ones_like(cells)
         for part in zip(*(each.split(RAY_CHUNK) for each in self.space.local(rays)), strict=True):
             misses = torch.ones(len(part[0]), dtype=torch.bool, device=cells.device)
@@ -133,7 +131,7 @@ class HashField(OccupiedField):
 
     @torch.no_grad()
     def hits(self, rays: Rays) -> Tensor:
-        """As of every field, ``[R]``, but of the cells that were not free when cells last settled."""
+        """Tell which rays, ``[R]``, may meet cells that were occupied when cells last settled."""
         rays = self.space.local(rays)
         ends = self.space.ends(rays, self.grid.box_around(self.met))
         return may_meet(rays, *ends, self.grid, self.met, block=2)  # cells are few, and large

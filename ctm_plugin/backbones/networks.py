@@ -44,7 +44,7 @@ class DirectedMLP(nn.Module):
         return blocked_mlp(features, entry, [layer.weight for layer in layers], [layer.bias for layer in layers])
 
     def whole(self, features: Tensor, embedded: Tensor, ray_index: Tensor) -> Tensor:
-        """As ``forward``, ``[M, channels]``, all in one go: what GPUs run, and what tests compare the blocks with."""
+        """``forward`` without blocks, ``[M, channels]``: run on GPUs, and by tests that compare the blocks with it."""
         return self.layers(torch.cat([features, embedded[ray_index]], dim=-1)).float().sigmoid()
 
 

@@ -87,7 +87,7 @@ class NGP(OccupiedBackbone):
         super().on_train_batch_start(batch, batch_idx)
 
     def look_for_free_space(self, step: int) -> None:
-        """Look for it before a step, when it is time."""
+        """Update the occupancy before a step, when it is due."""
         config = self.config
         times, rest = divmod(step - config.occupancy_first, config.occupancy_every)
         if times < 0 or rest:
@@ -102,7 +102,7 @@ class NGP(OccupiedBackbone):
             self.renew_pool()
 
     def shown_pixels(self) -> Tensor:
-        """``[S]``: flat indices of the training pixels that show something."""
+        """``[S]``: flat indices of the training pixels of the foreground."""
         shown = self.pixels[:, 3] > 0
         if self.unmasked is not None:
             shown &= torch.zeros_like(shown).index_fill_(0, self.unmasked.long(), True)
@@ -110,9 +110,8 @@ class NGP(OccupiedBackbone):
 
     @property
     def settles(self) -> bool:
-        """Whether cells become free for good: around an object. Not where only renderings get random backgrounds:
-        there, empty space has to become opaque.
-        """
+        """Whether cells may become permanently free: around an object with alpha, unless only renderings get random
+        backgrounds; there, empty space has to become opaque."""
         scene = self.scene
         straight = self.config.geometry == "bounded"
         return self.config.free_for_good > 0 and straight and scene.train.has_alpha and scene.background != "random"
@@ -122,7 +121,7 @@ class NGP(OccupiedBackbone):
         return visual_hull(points, self.scene.train, (0.5 / self.field.grid.scale).norm().item())
 
     def renew_pool(self) -> None:
-        """Draw training pixels from the rays that may meet something, once cells are free for good."""
+        """Draw training pixels from the rays that may meet an occupied cell, once cells are permanently free."""
         if self.settles and not self.field.met.all():
             self.draw_those(self.field.hits)
 

@@ -53,7 +53,7 @@ direction."""
 
 
 class OccupiedField(nn.Module):
-    """Density and latents in a space, which are asked for along rays where an occupancy grid leaves room for something.
+    """Density and latents in a space, evaluated at samples along rays that an occupancy grid does not call free.
 
     A subclass gives ``evaluate`` and may give ``reached``.
 
@@ -191,9 +191,8 @@ class OccupiedBackbone(Averaging, RadianceBackbone):
         return self.pictured_field.query(points, directions)
 
     def regularisers(self, batch: RayBatch, rendering: OccupiedRendering, target: Tensor) -> dict[str, Tensor]:
-        """How far apart the weights of a ray lie, and how close before its camera, as shares of the way from near to
-        far. ``target``: ``[R, k]``.
-        """
+        """Distortion of the weights along a ray, and their nearness to its camera, in shares of the way from near to
+        far. ``target``: ``[R, k]``."""
         space, samples, terms = self.field.space, rendering.samples, {}
         whole = space.far - space.near
         along = (samples.t - space.near) / whole

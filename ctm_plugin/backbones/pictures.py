@@ -19,7 +19,7 @@ from ctm_plugin.scene.views import Scene, Views, composite
 
 
 class RenderedView(NamedTuple):
-    """What a camera sees."""
+    """A rendered picture of H x W pixels."""
 
     latent: Float[Tensor, "h w k"]
     opacity: Float[Tensor, "h w"]
@@ -143,7 +143,7 @@ class PictureBackbone(PosedBackbone):
 
     @torch.no_grad()
     def render_view(self, views: Views, index: int, every: int = 1, rays: int | None = None) -> dict[str, Tensor]:
-        """As :meth:`~ctm_plugin.backbones.posed.PosedBackbone.render_view`; a pixel has no number of rays here."""
+        """See :meth:`~ctm_plugin.backbones.posed.PosedBackbone.render_view`; a pixel has no number of rays here."""
         background = self.transform.encode(self.constant_background())
         picture = self.render(views, index, background, None, every)
         latent = picture.latent.float()

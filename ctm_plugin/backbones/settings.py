@@ -18,7 +18,7 @@ SQUARES = tuple(side * side for side in range(1, 17))
 
 @dataclass(frozen=True, kw_only=True)
 class FieldConfig(Settings, section="backbone"):
-    """What all fields have whose rays are marched."""
+    """Settings of all fields whose rays are marched."""
 
     start: str = setting(
         "mean",

@@ -1,4 +1,4 @@
-"""Where a field lives whose samples lie evenly along rays: in a box of the world, in NDC, or in all of space."""
+"""Spaces in which samples lie evenly along rays: a box of the world, NDC, or all of space contracted."""
 
 from __future__ import annotations
 
@@ -43,11 +43,11 @@ class Box(nn.Module):
         self.longest = float((box[1] - box[0]).norm())
 
     def divide(self, stride: float) -> None:
-        """Set how far apart samples lie along its rays."""
+        """Set the distance between samples along its rays."""
         self.stride = stride
 
     def spacing(self, shape: Shape) -> float:
-        """The way along its rays from one vertex of a grid of that shape to the next."""
+        """Length along its rays from one vertex of a grid of that shape to the next."""
         return voxel_size(self.aabb, shape[0] * shape[1] * shape[2])
 
     def local(self, rays: Rays) -> Rays:
@@ -55,15 +55,16 @@ class Box(nn.Module):
         return rays
 
     def ends(self, rays: Rays, around: Tensor) -> tuple[Tensor, Tensor]:
-        """Where the samples of its rays begin and end, ``[R]`` each; outside ``around`` ``[2, 3]`` all is free."""
+        """First and last distance ``[R]`` of the samples of its rays; outside the box ``around`` ``[2, 3]`` all is
+        free."""
         return intersect_box(rays, around, self.near, self.far)
 
     def unit(self, points: Tensor) -> Tensor:
-        """Its points ``[M, 3]`` in the unit cube, of which shorter sides of the box fill a part."""
+        """Its points ``[M, 3]`` in the unit cube, scaled by the longest side."""
         return (points - self.aabb[0]) / self.side
 
     def lengths(self, t: Tensor, points: Tensor) -> Tensor | float:
-        """How long samples are, ``[M]`` or one number for all, in ``measure``."""
+        """Lengths of samples, ``[M]`` or one number for all, in ``measure``."""
         return self.stride / self.measure
 
     def distances(self, rays: Rays, t: Tensor, at: Any) -> Tensor:
@@ -71,12 +72,12 @@ class Box(nn.Module):
         return t
 
     def place(self, points: Tensor) -> tuple[Tensor, Tensor | float]:
-        """The world's points ``[M, 3]`` in the space, and how long a unit of length is there, as :meth:`lengths`."""
+        """The world's points ``[M, 3]`` in the space, and the length of a world's unit there, as :meth:`lengths`."""
         return points, 1 / self.measure
 
 
 class NDCSpace(Box):
-    """What forward-facing cameras see, in normalised device coordinates: rays run from 0 to 1, the measure is 1."""
+    """Normalised device coordinates of forward-facing cameras: rays run from 0 to 1, the measure is 1."""
 
     def __init__(self, box: Tensor, ndc: NDC, far: float):
         super().__init__(box, 0.0, 1.0, far)
@@ -136,7 +137,7 @@ class Ball(Box):
 
 
 def space_of(scene: Scene, geometry: str, box: Tensor | None = None) -> Box:
-    """The space that a geometry gives a scene; with a box ``[2, 3]`` of its own in place of all that cameras see."""
+    """The space of a scene by its geometry; with a box ``[2, 3]`` in place of all that cameras see."""
     train, near, far = scene.train, scene.near, scene.far
     if geometry == "unbounded":
         return Ball(*camera_ball(train, near), near, far)

@@ -102,7 +102,7 @@ class Splat(PictureBackbone):
 
     @cached_property
     def stages(self) -> list[Stage]:
-        """The parts of the schedule that see fewer pixels; found when a training begins."""
+        """Parts of the schedule whose pictures are averaged; computed when a training begins."""
         return stages(self.scene.train) if self.config.coarse else []
 
     def side_at(self, step: int | float) -> int:

@@ -79,7 +79,7 @@ class VoxelField(OccupiedField):
 
     @torch.no_grad()
     def update_occupancy(self) -> None:
-        """Take vertices out whose neighbourhood has no alpha above ``alpha_thre``."""
+        """Free vertices whose neighbourhood has no alpha above ``alpha_thre``."""
         self.occupancy &= self.dilated_alpha() > self.alpha_thre
 
     @torch.no_grad()

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import lightning as L
+import torch
 
 from ctm_plugin.backbones.base import Backbone
 from ctm_plugin.backbones.untouched import snapshot
@@ -79,10 +80,11 @@ class Dashboard(L.Callback):
         values["speed/ms_per_step"] = 1000 * each
         values["speed/rays_per_second"] = trainer.accumulate_grad_batches * pl_module.rays(before, step) / (now - then)
         values |= {f"field/{name}": value for name, value in pl_module.stats().items()}
-        # Lightning hands them to loggers when checkpoints of this step have been written.
-        pl_module.log_dict({name: float(value) for name, value in values.items()}, on_step=True, logger=False)
+        numbers = {name: float(value) for name, value in values.items()}
+        # What ``log`` is given Lightning looks at after every batch, and hands on after checkpoints are written.
+        trainer.callback_metrics.update({name: torch.tensor(number) for name, number in numbers.items()})
         for logger in trainer.loggers if trainer.is_global_zero else ():
-            logger.log_metrics({name: float(value) for name, value in values.items()}, step)
+            logger.log_metrics(numbers, step)
 
     def _pictures(self, trainer: L.Trainer, seen: Snapshot) -> None:
         values = {

@@ -67,7 +67,7 @@ class Auto(log.Space):
         return as_given(self.black + self.slopes[0] * torch.log1p(self.slopes[1] * rgb.double()), rgb)
 
     def _place(self) -> None:
-        """Find what follows from what was fitted, once: found at every use it was a tenth of a step's operators.
+        """Cache values derived from the fit: computing them at every use was a tenth of a step's operators.
 
         What black is encoded as, the range above it, where what is filled ends, and the ends of backgrounds: round
         black, so that they do not push colours to one side of it, and near, as all that is empty has to come near them.
@@ -93,7 +93,7 @@ class Auto(log.Space):
 
 
 def toe(level: float) -> float:
-    """How much steeper it may bend below 1/100 of white, where sRGB bends less: ``4 (2 s(L) / s(0) - 1)``, >= 0.
+    """Extra bend allowed below 1/100 of white, where sRGB bends less: ``4 (2 s(L) / s(0) - 1)``, >= 0.
 
     s is :func:`~ctm_plugin.color.srgb.srgb_slope`: the darker a scene is, the more its colours are light itself.
     """

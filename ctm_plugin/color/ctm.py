@@ -53,7 +53,7 @@ class SinusoidalMLP(nn.Module):
 
 
 class Given(NamedTuple):
-    """What a step's losses are of."""
+    """Colours and latents that a step's losses are computed from."""
 
     latents: list[Tensor]
     """``[R, k]``, rendered."""

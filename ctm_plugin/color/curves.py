@@ -29,7 +29,7 @@ MIN_LEVEL = 1e-3
 
 
 def nonblack(rgb: Float[Tensor, "n 3"], label: str) -> Float[Tensor, "m 3"]:
-    """Those of a scene's colours that are not black, as float64 on the CPU: a fit is the same on every device.
+    """Colours of a scene that are not black, as float64 on the CPU: a fit is the same on every device.
 
     Black ones say nothing of the scene: most are the background's. ``label`` says for messages what is fitted.
 
@@ -46,7 +46,7 @@ def nonblack(rgb: Float[Tensor, "n 3"], label: str) -> Float[Tensor, "m 3"]:
 
 
 def solve(increasing: Callable[[float], float], target: float, low: float, high: float) -> float:
-    """Where an increasing function of a number > 0 is ``target``, or the bound that is nearest to it."""
+    """Number > 0 where an increasing function is ``target``, or the nearest bound."""
     for _ in range(60):
         middle = math.sqrt(low * high)
         low, high = (middle, high) if increasing(middle) < target else (low, middle)

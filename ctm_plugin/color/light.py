@@ -21,7 +21,7 @@ from ctm_plugin.errors import ConfigError
 
 
 class Aim(NamedTuple):
-    """What a number is wanted to be, and how far off costs as much as one unit of another."""
+    """Target of a number, and the deviation from it that costs one unit."""
 
     at: float
     within: float
@@ -64,7 +64,7 @@ BISECTIONS = 60
 
 @dataclass(frozen=True)
 class Light:
-    """How pictures of a scene are shown to people; by default as they are.
+    """Gain, contrast and saturation with which pictures of a scene are displayed; by default as they are.
 
     Linear light x of a pixel, with luminance l = 0.2126 r + 0.7152 g + 0.0722 b, becomes sRGB y by::
 

@@ -37,7 +37,7 @@ def stops_of(light: str | float | None) -> float | None:
 
 @dataclass(frozen=True, kw_only=True)
 class LightConfig(Settings):
-    """How bright, and how vivid, pictures are shown."""
+    """Brightness and vividness of displayed pictures."""
 
     light: str = setting(
         "auto",
@@ -81,7 +81,7 @@ class LossConfig(Settings, section="loss"):
 
 @dataclass(frozen=True, kw_only=True)
 class TransformTraining(Settings, section="ctm"):
-    """How a learned transform is trained. The defaults are the paper's for NeRF and DVGO."""
+    """Training of a learned transform. The defaults are the paper's for NeRF and DVGO."""
 
     lr: float = setting(5e-4, "learning rate of the transform", above=0)
     betas: tuple[float, float] = setting((0.9, 0.999), "the two decay factors of the transform's Adam")
@@ -161,7 +161,7 @@ class CTMConfig(Settings, section="ctm"):
 
 @dataclass(frozen=True, kw_only=True)
 class AutoConfig(Settings, section="ctm"):
-    """How far the curve bends, and where in the latents a dark scene lies."""
+    """Bend of the curve, and the latents that a dark scene gets."""
 
     steepest: float = setting(
         4.0,  # a steeper curve costs PSNR, a flatter one shows haze in brightened pictures

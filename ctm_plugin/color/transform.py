@@ -61,18 +61,19 @@ class ColorTransform(nn.Module):
 
     @property
     def behind(self) -> Ends:
-        """Latents between which backgrounds are drawn that only renderings get."""
+        """(low, high) latents for backgrounds behind renderings only."""
         return self.filled
 
     def begin(self, rgb: Float[Tensor, "n 3"]) -> None:
-        """Be fitted to some of the scene's training colours, once, before anything is trained. Most have no need to.
+        """Fit the transform to some of the scene's training colours, once, before anything is trained. Most have
+        nothing to fit.
 
         What is found goes into buffers (``register_buffer``): checkpoints hold them, and no run that goes on, or is
         rendered, is fitted again.
         """
 
     def describe(self) -> str | None:
-        """What :meth:`begin` found, in a few words for people; ``None`` where nothing is fitted."""
+        """Summary of the fit in a few words; ``None`` where nothing is fitted."""
         return None
 
     def encode(self, rgb: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n k"]:
@@ -105,7 +106,7 @@ class ColorTransform(nn.Module):
         return ColorLoss({"color": reduce(add, (photometric(latent, target) for latent in latents))}, target)
 
     def cycle_loss(self, rgb: Float[Tensor, "r 3"], uniform: Uniform) -> Tensor:
-        """What a transform can learn from only colours, before there is a field: ``[]``, 0 for fixed ones."""
+        """Loss of pre-training on colours, without a field: ``[]``, 0 for fixed transforms."""
         return rgb.new_zeros(())
 
 

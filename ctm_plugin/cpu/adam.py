@@ -42,8 +42,8 @@ def _rows_of(grad: Tensor) -> tuple[Tensor, Tensor]:
     return grad._indices()[0].contiguous(), grad._values()
 
 
-BLOCK = 1024
-"""Rows that are looked through before those with a gradient are stepped."""
+ROW_BLOCK = 1024
+"""Rows that are tested for a gradient before those with one are stepped."""
 
 
 @inlined
@@ -69,10 +69,10 @@ def adam_rows(table, exp_avg, exp_avg_sq, rows, grad, rates, numbers):
             ``sqrt(1 - beta2^step)``, eps.
     """
     channels = grad.shape[1]
-    for block in prange((len(grad) + BLOCK - 1) // BLOCK):
+    for block in prange((len(grad) + ROW_BLOCK - 1) // ROW_BLOCK):
         # Which rows have a gradient no processor foresees: they are written down first, without asking.
-        seen, count = np.empty(BLOCK, np.int64), 0
-        for i in range(block * BLOCK, min((block + 1) * BLOCK, len(grad))):
+        seen, count = np.empty(ROW_BLOCK, np.int64), 0
+        for i in range(block * ROW_BLOCK, min((block + 1) * ROW_BLOCK, len(grad))):
             some = grad[i, 0] != 0
             if channels == 2:  # of hash grids; the loop would take longer to enter than to run
                 some |= grad[i, 1] != 0

@@ -7,6 +7,7 @@ import gc
 
 _M_TRIM_THRESHOLD, _M_TOP_PAD, _M_MMAP_THRESHOLD = -1, -2, -3  # glibc, malloc.h
 _HALF_GIB = 1 << 29
+"""Bytes in half a GiB."""
 
 
 def keep_memory() -> bool:

@@ -13,11 +13,12 @@ from ctm_plugin.cpu.compiled import compiled, fused_part
 from ctm_plugin.cpu.splats import E0, E1, E2, E3, E4, E5
 
 ZERO, ONE, TWO = (np.float32(value) for value in (0, 1, 2))
-DEEPEST, PART = np.float32(-16), np.float32(1 / 32)
-"""exp() is followed so far down; and of what part of its argument the polynomial is taken."""
+MIN_EXPONENT, EXP_SCALE = np.float32(-16), np.float32(1 / 32)
+"""Least argument of exp() that is computed, and the scale at which its polynomial is taken."""
 STRIDES = (1, 4)
-LEAST_SEEN, PER_EDGE = np.float32(0.1), np.float32(-1 / 0.03)
-"""The constants of :mod:`ctm_plugin.splats.render`, which this room does not know."""
+"""Pixels from one of three compared pixels to the next, as in :mod:`ctm_plugin.splats.render`."""
+MIN_OPACITY, PER_EDGE = np.float32(0.1), np.float32(-1 / 0.03)
+"""Least opacity and inverse edge width of :mod:`ctm_plugin.splats.render`, which this room does not know."""
 NEAR, FAR = STRIDES
 
 
@@ -57,7 +58,7 @@ class Bends(torch.autograd.Function):
 @fused_part
 def _exp(p):
     """exp() on [-16, 0], and what lies below as if it were -16: of p / 32, squared five times."""
-    q = max(p, DEEPEST) * PART
+    q = max(p, MIN_EXPONENT) * EXP_SCALE
     r = ((((E5 * q + E4) * q + E3) * q + E2) * q + E1) * q + E0
     r = r * r
     r = r * r
@@ -102,7 +103,7 @@ def fold(inverse, stopped, colors, scales, surface, pulls, sums, grad):
     height, width = inverse.shape
     for y in prange(height):
         for x in range(width):
-            surface[y, x] = inverse[y, x] / max(stopped[y, x], LEAST_SEEN)
+            surface[y, x] = inverse[y, x] / max(stopped[y, x], MIN_OPACITY)
     for y in prange(height):
         one, other = np.empty(width, np.float32), np.empty(width, np.float32)
         for number in range(2):
@@ -120,20 +121,20 @@ def fold(inverse, stopped, colors, scales, surface, pulls, sums, grad):
                     one, other, pulls[2 + number, y, k : k + count], scales[2 + number], count,
                 )  # fmt: skip
     for y in prange(height):
-        found = np.zeros(width, np.float32)
+        depth_grad = np.zeros(width, np.float32)
         for number in range(2):
             k = NEAR if number == 0 else FAR
             down, across = pulls[number], pulls[2 + number, y]
             for x in range(width):
-                found[x] -= TWO * (down[y, x] + across[x])
+                depth_grad[x] -= TWO * (down[y, x] + across[x])
             if y >= k:
                 for x in range(width):
-                    found[x] += down[y - k, x]
+                    depth_grad[x] += down[y - k, x]
             if y + k < height:
                 for x in range(width):
-                    found[x] += down[y + k, x]
+                    depth_grad[x] += down[y + k, x]
             for x in range(width - k):
-                found[x + k] += across[x]
-                found[x] += across[x + k]
+                depth_grad[x + k] += across[x]
+                depth_grad[x] += across[x + k]
         for x in range(width):
-            grad[y, x] = found[x] / max(stopped[y, x], LEAST_SEEN)
+            grad[y, x] = depth_grad[x] / max(stopped[y, x], MIN_OPACITY)

@@ -10,14 +10,14 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-BLOCK = 1 << 21
+BLOCK_BYTES = 1 << 21
 """Bytes of a block of the widest layer."""
-STRIDE = 128
-"""The last block is filled up with zeros to a multiple of so many rows: products of a shape that has not been met yet
-take a millisecond to prepare, and samples are as many as they are."""
-LANES = 8
-"""The first layer's input has a column of ones, for its bias, and is filled up to a multiple of so many: products with
-an odd number of columns take half as long again."""
+ROW_MULTIPLE = 128
+"""The last block is padded with zero rows to a multiple of this: oneDNN takes a millisecond to prepare products of a
+new shape."""
+COLUMN_STEP = 8
+"""The first layer's input has a column of ones, for its bias, and is padded to a multiple of this: products with an odd
+number of columns take half as long again."""
 
 
 @runtime_checkable
@@ -60,7 +60,7 @@ class _BlockedMLP(torch.autograd.Function):
         depth = len(flat) // 2
         entered = flat[0].shape[1]
         first = torch.cat([flat[0], flat[depth][:, None]], dim=1)
-        weights = [F.pad(first, (0, -first.shape[1] % LANES)).to(dtype), *(w.to(dtype) for w in flat[1:depth])]
+        weights = [F.pad(first, (0, -first.shape[1] % COLUMN_STEP)).to(dtype), *(w.to(dtype) for w in flat[1:depth])]
         biases = [*(b.to(dtype) for b in flat[depth + 1 : -1]), flat[-1]]
         blocks = _blocks(len(table), weights)
         kept_rows = sum(rows for _, rows in blocks) if keep else max((rows for _, rows in blocks), default=0)
@@ -111,7 +111,7 @@ class _BlockedMLP(torch.autograd.Function):
 
 
 def _sums(grad: Tensor) -> Tensor:
-    """Of the columns: ``[n, E]`` to ``[E]``. Those of half precision are products with ones, which take an eighth of
+    """Column sums: ``[n, E]`` to ``[E]``. Those of half precision are products with ones, which take an eighth of
     the time of torch's sums and are rounded as the weights' gradients are.
     """
     return grad.sum(0) if grad.dtype == torch.float32 else (grad.new_ones(1, len(grad)) @ grad).squeeze(0)
@@ -119,6 +119,6 @@ def _sums(grad: Tensor) -> Tensor:
 
 def _blocks(rows: int, weights: Sequence[Tensor]) -> list[tuple[slice, int]]:
     """The rows of each block, and how many they are when filled up."""
-    size = max(1, BLOCK // max(weight[0].nbytes for weight in weights) // STRIDE) * STRIDE
+    size = max(1, BLOCK_BYTES // max(weight[0].nbytes for weight in weights) // ROW_MULTIPLE) * ROW_MULTIPLE
     blocks = [slice(start, min(start + size, rows)) for start in range(0, rows, size)]
-    return [(block, math.ceil((block.stop - block.start) / STRIDE) * STRIDE) for block in blocks]
+    return [(block, math.ceil((block.stop - block.start) / ROW_MULTIPLE) * ROW_MULTIPLE) for block in blocks]

@@ -21,13 +21,14 @@ from torch import Tensor
 from ctm_plugin.cpu.threads import loop_threads
 
 _LOCK = threading.Lock()
-"""Where no OpenMP is found, numba's own threads end the process when two threads of Python call at once."""
+"""Lock of all loops where no OpenMP is found: numba's own threads end the process if two threads of Python call at
+once."""
 
 FUSED = {"contract", "reassoc", "nsz"}
-"""What ``fused`` allows LLVM."""
+"""LLVM's fast-math flags that ``fused`` allows."""
 
 LOCK_S = 120.0
-"""How long to wait for another process that compiles."""
+"""Seconds to wait for another process that compiles."""
 
 
 def compiled(signature: str, fused: bool = False, parallel: bool = True) -> Callable[[Callable], Callable]:

@@ -13,8 +13,8 @@ from ctm_plugin.cpu.compiled import compiled, fused_part
 
 WINDOW, SIGMA = 11, 1.5
 C1, C2, ONE, TWO, ZERO = (np.float32(value) for value in (0.01**2, 0.03**2, 1, 2, 0))
-BAND = 64
-"""Rows of the gradient that are found together; those around them that they need are blurred once more."""
+BAND_ROWS = 64
+"""Rows of the gradient that are computed together; the rows around them are blurred once more."""
 _line = np.exp(-(np.arange(6.0) ** 2) / (2 * SIGMA**2))
 W0, W1, W2, W3, W4, W5 = (np.float32(value) for value in _line / (2 * _line.sum() - 1))
 """The window's weights from the middle outwards."""
@@ -115,10 +115,10 @@ def compare(a, b, scale, sums, grad):
     """
     channels, height, width = a.shape
     high, wide, factor = height - WINDOW + 1, width - WINDOW + 1, np.float32(scale)
-    bands = (height + BAND - 1) // BAND
+    bands = (height + BAND_ROWS - 1) // BAND_ROWS
     for part in prange(channels * bands):
-        c, top = part // bands, part % bands * BAND
-        bottom = min(top + BAND, height)
+        c, top = part // bands, part % bands * BAND_ROWS
+        bottom = min(top + BAND_ROWS, height)
         rows, slopes = np.empty((5, WINDOW, wide), np.float32), np.zeros((3, WINDOW, wide), np.float32)
         products, blurred = np.empty((3, width), np.float32), np.empty((5, wide), np.float32)
         spread, found = np.zeros((3, width + WINDOW - 1), np.float32), np.empty((3, width), np.float32)

@@ -19,29 +19,29 @@ from ctm_plugin.cpu.hash_grid import layout_of, looked_up
 
 # numba would take float64 for products of float32 with Python's numbers.
 ZERO, ONE = np.float32(0), np.float32(1)
-DENSEST = np.float32(15)
-"""As ``rays/hash_density.DENSEST``."""
-TILE = 256
-"""Samples of a tile, at most."""
-LANES = 32
-"""Tiles are filled up to a multiple of so many, which fill two registers of AVX-512."""
-ROW = TILE + 16
-"""From a row of a tile to the next: a power of two apart they would take one another's place in the cache."""
-AHEAD = 8
-"""Samples of a ray that are looked at before it is asked whether light goes on."""
-TOGETHER = TILE // AHEAD
+MAX_LOG = np.float32(15)
+"""Largest logarithm of a density, as in :mod:`ctm_plugin.rays.hash_density`."""
+TILE_SAMPLES = 256
+"""Most samples of a tile."""
+SAMPLE_MULTIPLE = 32
+"""Tiles are padded to a multiple of this: two registers of AVX-512."""
+STRIDE = TILE_SAMPLES + 16
+"""Numbers from a tile's row to the next: rows a power of two apart would share cache lines."""
+RAY_SAMPLES = 8
+"""Samples of a ray that are evaluated before its transmittance is tested."""
+TILE_RAYS = TILE_SAMPLES // RAY_SAMPLES
 """Rays that share a tile."""
-PARTS = 4
-"""Of the samples, for each thread: some rays have many of them, some none."""
+PARTS_PER_THREAD = 4
+"""Parts of the samples for each thread: some rays have many samples, some none."""
 
 
 def log_density(
     table: Tensor, sides: Tensor, starts: Tensor, first: nn.Linear, last: nn.Linear, points: Tensor
 ) -> Tensor:
     """Do as :func:`ctm_plugin.rays.hash_density.log_density`."""
-    found = points.new_empty(len(points))
-    _log_density(table, points.T.contiguous(), sides, starts, *_network(first, last), found, torch.get_num_threads())
-    return found
+    density = points.new_empty(len(points))
+    _log_density(table, points.T.contiguous(), sides, starts, *_network(first, last), density, torch.get_num_threads())
+    return density
 
 
 def lit(
@@ -52,7 +52,7 @@ def lit(
     ends = torch.searchsorted(ray_index, torch.arange(n_rays + 1))
     marked, features = torch.zeros(len(points), dtype=torch.bool), table.new_empty(len(points), first.in_features)
     least = -math.log1p(-threshold)  # optical depth of such an alpha
-    numbers = lengths.contiguous(), np.float32(least), np.float32(threshold), PARTS * torch.get_num_threads()
+    numbers = lengths.contiguous(), np.float32(least), np.float32(threshold), PARTS_PER_THREAD * torch.get_num_threads()
     _lit(table, points.T.contiguous(), sides, starts, *_network(first, last), ends, *numbers, marked, features)
     kept = marked.nonzero().squeeze(1)
     return kept, features.index_select(0, kept)
@@ -81,12 +81,12 @@ def _clear(tile, rows, width):
 @fused_part
 def _tiles(sizes, first, last):
     """Make the tiles of what enters both layers, and of what leaves them."""
-    entered, hidden = np.empty((first.shape[1], ROW), np.float32), np.empty((last.shape[1], ROW), np.float32)
+    entered, hidden = (np.empty((first.shape[1], STRIDE), np.float32), np.empty((last.shape[1], STRIDE), np.float32))
     for tile, size in ((entered, sizes[0]), (hidden, sizes[1])):
-        _clear(tile[size:], len(tile) - size, TILE)
-        for t in range(TILE):
+        _clear(tile[size:], len(tile) - size, TILE_SAMPLES)
+        for t in range(TILE_SAMPLES):
             tile[size, t] = ONE
-    return entered, hidden, np.empty((last.shape[0], ROW), np.float32)
+    return entered, hidden, np.empty((last.shape[0], STRIDE), np.float32)
 
 
 @fused_part
@@ -134,43 +134,43 @@ def _encode(table, points, sides, starts, index, count, width, tile):
 @fused_part
 def _evaluate(table, points, sides, starts, sizes, first, last, index, count, tiles):
     """Give the network's first number for so many points, side by side."""
-    entered, hidden, found = tiles
-    width = (count + LANES - 1) // LANES * LANES
+    entered, hidden, out = tiles
+    width = (count + SAMPLE_MULTIPLE - 1) // SAMPLE_MULTIPLE * SAMPLE_MULTIPLE
     _encode(table, points, sides, starts, index, count, width, entered)
     _times(first, entered, sizes[1], sizes[0] + 1, width, True, hidden)
     for t in range(width):  # a number of units that is no multiple of four leaves others than ones there
         hidden[sizes[1], t] = ONE
-    _times(last, hidden, 1, sizes[1] + 1, width, False, found)
-    return found[0]
+    _times(last, hidden, 1, sizes[1] + 1, width, False, out)
+    return out[0]
 
 
 _NETWORK = "f4[:,::1], f4[:,::1], i8[::1], i8[::1], i8[::1], f4[:,::1], f4[:,::1]"
 
 
 @compiled(f"void({_NETWORK}, f4[::1], i8)", fused=True)
-def _log_density(table, points, sides, starts, sizes, first, last, found, parts):
-    tiles = (points.shape[1] + TILE - 1) // TILE
+def _log_density(table, points, sides, starts, sizes, first, last, density, parts):
+    tiles = (points.shape[1] + TILE_SAMPLES - 1) // TILE_SAMPLES
     for part in prange(parts):
-        values, index = _tiles(sizes, first, last), np.empty(TILE, np.int64)
+        values, index = _tiles(sizes, first, last), np.empty(TILE_SAMPLES, np.int64)
         for tile in range(part * tiles // parts, (part + 1) * tiles // parts):
-            begin = tile * TILE
-            count = min(TILE, points.shape[1] - begin)
+            begin = tile * TILE_SAMPLES
+            count = min(TILE_SAMPLES, points.shape[1] - begin)
             for t in range(count):
                 index[t] = begin + t
             row = _evaluate(table, points, sides, starts, sizes, first, last, index, count, values)
             for t in range(count):
-                found[begin + t] = row[t]
+                density[begin + t] = row[t]
 
 
 @compiled(f"void({_NETWORK}, i8[::1], f4[::1], f4, f4, i8, b1[::1], f4[:,::1])", fused=True)
 def _lit(table, points, sides, starts, sizes, first, last, ends, lengths, least, threshold, parts, kept, features):
     rays = len(ends) - 1
     for part in prange(parts):
-        values, index = _tiles(sizes, first, last), np.empty(TILE, np.int64)
-        light, at, until = np.empty(TOGETHER), np.empty(TOGETHER, np.int64), np.empty(TOGETHER, np.int64)
+        values, index = _tiles(sizes, first, last), np.empty(TILE_SAMPLES, np.int64)
+        light, at, until = np.empty(TILE_RAYS), np.empty(TILE_RAYS, np.int64), np.empty(TILE_RAYS, np.int64)
         ray, stop, active = part * rays // parts, (part + 1) * rays // parts, 0
         while True:
-            while active < TOGETHER and ray < stop:  # in the place of rays that have ended
+            while active < TILE_RAYS and ray < stop:  # in the place of rays that have ended
                 if ends[ray] < ends[ray + 1]:
                     light[active], at[active], until[active] = 1.0, ends[ray], ends[ray + 1]
                     active += 1
@@ -179,16 +179,16 @@ def _lit(table, points, sides, starts, sizes, first, last, ends, lengths, least,
                 break
             count = 0
             for r in range(active):
-                for m in range(at[r], min(at[r] + AHEAD, until[r])):
+                for m in range(at[r], min(at[r] + RAY_SAMPLES, until[r])):
                     index[count] = m
                     count += 1
             row = _evaluate(table, points, sides, starts, sizes, first, last, index, count, values)
             count, going = 0, 0
             for r in range(active):
                 now = light[r]
-                end = min(at[r] + AHEAD, until[r])
+                end = min(at[r] + RAY_SAMPLES, until[r])
                 for m in range(at[r], end):
-                    depth = math.exp(min(row[count], DENSEST)) * (lengths[m] if len(lengths) > 1 else lengths[0])
+                    depth = math.exp(min(row[count], MAX_LOG)) * (lengths[m] if len(lengths) > 1 else lengths[0])
                     if depth > least and now > threshold:
                         kept[m] = True
                         for f in range(sizes[0]):

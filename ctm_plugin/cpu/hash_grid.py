@@ -10,8 +10,9 @@ from torch import Tensor
 from ctm_plugin.cpu.compiled import compiled, inlined
 
 FEATURES = 2
-SECOND, THIRD = 2654435761, 805459861
-"""What the second and the third coordinate of a vertex are multiplied by."""
+"""Features a row of the tables."""
+PRIME_Y, PRIME_Z = 2654435761, 805459861
+"""Primes that the second and third coordinate of a vertex are multiplied by."""
 
 
 def encoded(table: Tensor, points: Tensor, sides: Tensor, starts: Tensor) -> Tensor:
@@ -43,8 +44,8 @@ def _cell(x, side):
 def layout_of(side, rows):
     """Whether a level has a row for each vertex, the mask of its rows, and what y and z are multiplied by."""
     dense = (side + 1) ** 3 <= rows
-    along_y = side + 1 if dense else np.int64(SECOND)
-    along_z = (side + 1) ** 2 if dense else np.int64(THIRD)
+    along_y = side + 1 if dense else np.int64(PRIME_Y)
+    along_z = (side + 1) ** 2 if dense else np.int64(PRIME_Z)
     return dense, rows - 1, along_y, along_z
 
 

@@ -9,39 +9,39 @@ from torch import Tensor
 
 from ctm_plugin.cpu.compiled import compiled
 
-BLOCK = 256
-"""Rows a block; blocks that no index falls into are skipped."""
-OWNED = 12
-"""Binary digits of the rows in a row that one thread owns: a ray stays among them for a while, so that processors
-foresee whose its next corner is."""
-CACHED = 1 << 19
-"""Numbers that one thread adds up in less time than several take to find their own."""
+ROW_BLOCK = 256
+"""Rows a block; blocks without an index are skipped."""
+LOG2_OWNED_ROWS = 12
+"""log2 of contiguous rows per thread: a ray stays within them for a while, which branch prediction likes."""
+SERIAL_NUMBERS = 1 << 19
+"""Most numbers that one thread adds faster than several find their own."""
 
 
-SPARSE = 5
-"""Measured, Adam included: from here to 6 a sparse and a dense gradient take equally long."""
+SPARSE_FACTOR = 5
+"""Table rows per used row from which a sparse gradient pays. Measured, Adam included: at 5 to 6 both take equally
+long."""
 
 
 def numbers_at(table: Tensor, rows: Tensor, weights: Tensor) -> Tensor:
     """Sum ``weights[m, i] table[rows[m, i]]`` over i, of a table ``[V, 1]``: ``[M, 1]``."""
-    found = table.new_empty(len(rows), 1)
-    _numbers_at(table.reshape(-1), rows.int(), weights, found.view(-1))
-    return found
+    values = table.new_empty(len(rows), 1)
+    _numbers_at(table.reshape(-1), rows.int(), weights, values.view(-1))
+    return values
 
 
 @compiled("void(f4[::1], i4[:,::1], f4[:,::1], f4[::1])", fused=True)
-def _numbers_at(table, rows, weights, found):
+def _numbers_at(table, rows, weights, values):
     for m in prange(rows.shape[0]):
         total = np.float32(0)
         for corner in range(rows.shape[1]):
             total += weights[m, corner] * table[rows[m, corner]]
-        found[m] = total
+        values[m] = total
 
 
 def gradient(rows: Tensor, weights: Tensor, grad: Tensor, shape: torch.Size, sparse: bool) -> Tensor:
     """Do as :func:`ctm_plugin.rays.grid.scattered`, row by row; ``sparse`` where few rows are used."""
     rows = rows.int()
-    if sparse and SPARSE * rows.numel() < shape.numel():
+    if sparse and SPARSE_FACTOR * rows.numel() < shape.numel():
         touched, sums = sums_of_rows(rows, weights, grad, shape[0])
         return torch.sparse_coo_tensor(touched[None], sums, shape, is_coalesced=True, check_invariants=False)
     sums = grad.new_zeros(shape)
@@ -67,7 +67,7 @@ def sums_of_rows(rows: Tensor, weights: Tensor, grad: Tensor, count: int) -> tup
 def add_rows(rows: Tensor, weights: Tensor, grad: Tensor, index: Tensor, sums: Tensor) -> None:
     """Add ``weights[m, i] grad[m]`` to ``sums[index[rows[m, i]]]`` in place; no ``index``: of the rows themselves."""
     parts = 1 << torch.get_num_threads().bit_length() - 1
-    few = grad.shape[1] == 1 and sums.numel() < CACHED
+    few = grad.shape[1] == 1 and sums.numel() < SERIAL_NUMBERS
     _add(rows, weights, grad.contiguous(), index, sums, 1 if few else parts)
 
 
@@ -79,32 +79,32 @@ def _touched(rows, touched, index):
         touched: ``[V]`` zeros, left with ones where a row is named.
         index: ``[V]``, left with the position in the result of each row that is named.
     """
-    blocks = (len(touched) + BLOCK - 1) // BLOCK
+    blocks = (len(touched) + ROW_BLOCK - 1) // ROW_BLOCK
     named = np.zeros(blocks, np.uint8)
     for m in prange(rows.shape[0]):
         for corner in range(rows.shape[1]):
             row = rows[m, corner]
             if not touched[row]:  # other threads need not fetch again what has not changed
                 touched[row] = 1
-                named[row // BLOCK] = 1
+                named[row // ROW_BLOCK] = 1
     ends = np.zeros(blocks + 1, np.int64)
     for block in prange(blocks):
         count = 0
         if named[block]:
-            for row in range(block * BLOCK, min((block + 1) * BLOCK, len(touched))):
+            for row in range(block * ROW_BLOCK, min((block + 1) * ROW_BLOCK, len(touched))):
                 count += touched[row]
         ends[block + 1] = count
     ends = ends.cumsum()
-    found = np.empty(ends[-1], np.int64)
+    used = np.empty(ends[-1], np.int64)
     for block in prange(blocks):
         if named[block]:
             at = ends[block]
-            for row in range(block * BLOCK, min((block + 1) * BLOCK, len(touched))):
+            for row in range(block * ROW_BLOCK, min((block + 1) * ROW_BLOCK, len(touched))):
                 if touched[row]:
-                    found[at] = row
+                    used[at] = row
                     index[row] = at
                     at += 1
-    return found
+    return used
 
 
 @compiled("void(i4[:,::1], f4[:,::1], f4[:,::1], i4[::1], f4[:,::1], i8)")
@@ -117,7 +117,7 @@ def _add(rows, weights, grad, index, sums, parts):
         for m in range(rows.shape[0]):
             for corner in range(rows.shape[1]):
                 row = rows[m, corner]
-                if (row >> OWNED) & (parts - 1) == part:
+                if (row >> LOG2_OWNED_ROWS) & (parts - 1) == part:
                     at = index[row] if len(index) else row
                     weight = weights[m, corner]
                     for c in range(grad.shape[1]):

@@ -8,10 +8,10 @@ from functools import cache
 
 import torch
 
-SHAPES = ((64, 27, 64), (512, 34, 256), (2048, 256, 256), (512, 256, 3))
-"""Rows, inner and outer sizes of the products that are tried: colour transforms, first, hidden and last layers."""
-EXACT = 2e-6
-"""Relative error of a float32 product, with room; of one with bfloat16 inside it is a thousand times as much."""
+PRODUCT_SHAPES = ((64, 27, 64), (512, 34, 256), (2048, 256, 256), (512, 256, 3))
+"""Rows, inner and outer sizes of the tested products: colour transforms, first, hidden and last layers."""
+MAX_ERROR = 2e-6
+"""Largest relative error of a float32 product, with room; with bfloat16 inside it is a thousand times as much."""
 
 
 @contextmanager
@@ -42,7 +42,7 @@ def fast_products(device: torch.device) -> Iterator[bool]:
 @cache
 def _exact(threads: int) -> bool:
     """Whether products lose nothing, as torch is set now; tried out once for a number of threads."""
-    return max(product_error(*shape) for shape in SHAPES) < EXACT
+    return max(product_error(*shape) for shape in PRODUCT_SHAPES) < MAX_ERROR
 
 
 @torch.no_grad()

@@ -16,12 +16,12 @@ from torch import Tensor
 
 from ctm_plugin.cpu.compiled import compiled, inlined
 
-BLOCK = 4
-"""Vertices a side of the blocks that are passed in one go where none of them is occupied."""
-SHARE = 8
-"""Blocks are looked for where vertices are at most so many times the samples: it takes 0.6 ms for a million."""
-SKIPPED = 1 << 20
-"""Samples, at most."""
+BLOCK_SIDE = 4
+"""Vertices along a block's side; blocks without an occupied vertex are skipped."""
+MAX_VERTEX_RATIO = 8
+"""Largest ratio of vertices to samples for which blocks are marked: it takes 0.6 ms for a million vertices."""
+MAX_SKIPPED = 1 << 20
+"""Most samples that are skipped at once."""
 
 
 def occupied_samples(
@@ -38,7 +38,7 @@ def occupied_samples(
     rays = *(each.contiguous() for each in (origins, directions, first, counts)), np.float32(step)
     begin = counts.cumsum(0) - counts
     hits = counts.new_empty(int(counts.sum()), dtype=torch.int32)
-    skip = not contracted and SHARE * len(hits) >= len(occupancy)
+    skip = not contracted and MAX_VERTEX_RATIO * len(hits) >= len(occupancy)
     blocks = torch.from_numpy(occupied_blocks(occupancy, last.long() + 1)) if skip else occupancy.new_empty(1, 1, 1)
     kept = torch.from_numpy(find_occupied(*rays, occupancy, blocks, low, scale, last, contracted, skip, begin, hits))
     starts, total = kept.cumsum(0) - kept, int(kept.sum())
@@ -94,25 +94,29 @@ def _point(origin, direction, t, contracted):
 
 @compiled("b1[:,:,::1](b1[::1], i8[::1])")
 def occupied_blocks(occupancy, shape):
-    """Mark the blocks of ``BLOCK`` vertices a side that have an occupied one: ``[ceil(X / BLOCK), ...]``."""
-    of_x, of_y, of_z = (shape[0] - 1) // BLOCK + 1, (shape[1] - 1) // BLOCK + 1, (shape[2] - 1) // BLOCK + 1
+    """Mark the blocks of ``BLOCK_SIDE`` vertices a side that have an occupied one: ``[ceil(X / BLOCK_SIDE), ...]``."""
+    of_x, of_y, of_z = (
+        (shape[0] - 1) // BLOCK_SIDE + 1,
+        (shape[1] - 1) // BLOCK_SIDE + 1,
+        (shape[2] - 1) // BLOCK_SIDE + 1,
+    )
     blocks = np.zeros((of_x, of_y, of_z), np.bool_)
     for block in prange(of_x):
-        for x in range(block * BLOCK, min((block + 1) * BLOCK, shape[0])):
+        for x in range(block * BLOCK_SIDE, min((block + 1) * BLOCK_SIDE, shape[0])):
             for y in range(shape[1]):
                 row = (x * shape[1] + y) * shape[2]
                 for z in range(shape[2]):
-                    blocks[block, y // BLOCK, z // BLOCK] |= occupancy[row + z]
+                    blocks[block, y // BLOCK_SIDE, z // BLOCK_SIDE] |= occupancy[row + z]
     return blocks
 
 
 @inlined
 def _left(position, vertex, pace):
     """How many samples it takes to leave a block along one axis: no more than so, whatever was rounded."""
-    begin = np.float32(vertex // BLOCK * BLOCK) - np.float32(0.5)
-    end = begin + np.float32(BLOCK)
+    begin = np.float32(vertex // BLOCK_SIDE * BLOCK_SIDE) - np.float32(0.5)
+    end = begin + np.float32(BLOCK_SIDE)
     if pace == 0:
-        return np.float32(SKIPPED)
+        return np.float32(MAX_SKIPPED)
     return ((end if pace > 0 else begin) - position) / pace
 
 
@@ -138,7 +142,7 @@ def find_occupied(
                 _position(z, 2, low, scale, last),
             )
             vx, vy, vz = _nearest(px), _nearest(py), _nearest(pz)
-            if not skip or blocks[vx // BLOCK, vy // BLOCK, vz // BLOCK]:
+            if not skip or blocks[vx // BLOCK_SIDE, vy // BLOCK_SIDE, vz // BLOCK_SIDE]:
                 hits[m] = j
                 m += occupancy[(vx * of_y + vy) * of_z + vz]
                 j += 1
@@ -150,7 +154,7 @@ def find_occupied(
                 )
                 # A hundredth of a sample is more than all rounding; for NaN too the next one.
                 left -= np.float32(0.01)
-                j += 1 + (np.int64(min(left, np.float32(SKIPPED))) if left > 0 else 0)
+                j += 1 + (np.int64(min(left, np.float32(MAX_SKIPPED))) if left > 0 else 0)
         kept[r] = m - begin[r]
     return kept
 

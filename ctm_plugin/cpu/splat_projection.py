@@ -10,13 +10,14 @@ from numba import prange
 from ctm_plugin.cpu.compiled import compiled, fused_part
 
 ZERO, HALF, ONE, TWO = (np.float32(value) for value in (0, 0.5, 1, 2))
-BLUR = np.float32(0.3)
+EPS2D = np.float32(0.3)
+"""Variance in pixels squared that is added to each projected Gaussian."""
 PLANE, INVERSE = 3, 1
 """Channels after the colours, see :mod:`ctm_plugin.splats.render`."""
 MEAN, CONIC, OPACITY, DEPTH, EXTENT, REACH, WIDTH, OVER, GEOMETRY = 0, 2, 5, 6, 7, 9, 10, 12, 14
-"""Where a Gaussian's numbers on the picture begin: mean 2, conic 3, opacity, depth, extent 2 (0: it is not shown), the
-squared radius of its ellipse in standard deviations, variance along x at a given y and along y at a given x, one over
-the variances along x and y; and how many these are."""
+"""Offsets of a Gaussian's numbers in its row: mean 2, conic 3, opacity, depth, extent 2 (0: invisible), squared radius
+of its ellipse in standard deviations, variance along x at a given y and along y at a given x, inverse variances along x
+and y; and the row's length."""
 
 
 @fused_part
@@ -44,9 +45,9 @@ def _harmonics(basis, g, x, y, z, degrees):
 
 
 @fused_part
-def _rotation(turns, g):
+def _rotation(quats, g):
     """A quaternion's matrix, row by row, and one over its length."""
-    w, x, y, z = turns[g, 0], turns[g, 1], turns[g, 2], turns[g, 3]
+    w, x, y, z = quats[g, 0], quats[g, 1], quats[g, 2], quats[g, 3]
     over = ONE / math.sqrt(w * w + x * x + y * y + z * z)
     w, x, y, z = w * over, x * over, y * over, z * over
     return (
@@ -87,13 +88,13 @@ def _slopes(u, v, camera):
     "void(f4[:,::1], f4[:,::1], f4[:,::1], f4[:,::1], f4[:,::1], f4[:,::1], f4[:,::1], f4[::1], i8, f4[:,::1],"
     " f4[:,::1], f4[:,::1])", fused=True,
 )  # fmt: skip
-def project(means, scales, turns, opacities, base, rest, shift, camera, degrees, flat, basis, colors):
+def project(means, scales, quats, opacities, sh0, shN, shift, camera, degrees, flat, basis, colors):
     """Write where Gaussians lie on the picture, the harmonics of their directions, and their colours.
 
     As :func:`ctm_plugin.splats.gaussians.project`, with the channels of :mod:`ctm_plugin.splats.render` after the
     colours where these have room for them.
     """
-    k = base.shape[1]
+    k = sh0.shape[1]
     for g in prange(len(means)):
         flat[g, :] = ZERO
         flat[g, DEPTH] = np.float32(1e30)
@@ -106,7 +107,7 @@ def project(means, scales, turns, opacities, base, rest, shift, camera, degrees,
         mx, my = x + xu * (u - cu) + xv * (v - cv) + shift[g, 0], y + yu * (u - cu) + yv * (v - cv) + shift[g, 1]
         j0, j1, j2 = xu * over_z, xv * over_z, -(xu * cu + xv * cv) * over_z
         j3, j4, j5 = yu * over_z, yv * over_z, -(yu * cu + yv * cv) * over_z
-        r = _rotation(turns, g)
+        r = _rotation(quats, g)
         xx, xy, yy, xz, yz = ZERO, ZERO, ZERO, ZERO, ZERO
         for axis in range(3):
             size = math.exp(scales[g, axis])
@@ -120,8 +121,8 @@ def project(means, scales, turns, opacities, base, rest, shift, camera, degrees,
             yy += q * q
             xz += p * c
             yz += q * c
-        xx += BLUR
-        yy += BLUR
+        xx += EPS2D
+        yy += EPS2D
         ex, ey = math.sqrt(reach * xx), math.sqrt(reach * yy)
         if not (mx + ex > ZERO and mx - ex < TWO * camera[25] and my + ey > ZERO and my - ey < TWO * camera[26]):
             continue
@@ -136,9 +137,9 @@ def project(means, scales, turns, opacities, base, rest, shift, camera, degrees,
         over = ONE / math.sqrt(x * x + y * y + z * z)
         _harmonics(basis, g, x * over, y * over, z * over, degrees)
         for channel in range(k):
-            color = HALF + basis[g, 0] * base[g, channel]
+            color = HALF + basis[g, 0] * sh0[g, channel]
             for i in range(1, degrees * degrees):
-                color += basis[g, i] * rest[g, (i - 1) * k + channel]
+                color += basis[g, i] * shN[g, (i - 1) * k + channel]
             colors[g, channel] = max(color, camera[24])
         if colors.shape[1] == k + INVERSE:
             colors[g, k] = camera[23] * over_z
@@ -153,11 +154,11 @@ def project(means, scales, turns, opacities, base, rest, shift, camera, degrees,
     " f4[:,::1])", fused=True,
 )  # fmt: skip
 def project_back(
-    means, scales, turns, opacities, base, rest, camera, degrees, flat, basis, colors, starts, slots, rows,
+    means, scales, quats, opacities, sh0, shN, camera, degrees, flat, basis, colors, starts, slots, rows,
     d_means, d_scales, d_turns, d_opacities, d_base, d_rest, d_shift,
 ):  # fmt: skip
     """Sum each Gaussian's rows of gradients up and take them back to its parameters."""
-    k = base.shape[1]
+    k = sh0.shape[1]
     for g in prange(len(means)):
         d_means[g, :], d_scales[g, :], d_turns[g, :], d_opacities[g, 0] = ZERO, ZERO, ZERO, ZERO
         d_base[g, :], d_rest[g, :], d_shift[g, :] = ZERO, ZERO, ZERO
@@ -195,9 +196,9 @@ def project_back(
         b0 = camera[0] * j3 + camera[3] * j4 + camera[6] * j5
         b1 = camera[1] * j3 + camera[4] * j4 + camera[7] * j5
         b2 = camera[2] * j3 + camera[5] * j4 + camera[8] * j5
-        r = _rotation(turns, g)
+        r = _rotation(quats, g)
         da0, da1, da2, db0, db1, db2 = ZERO, ZERO, ZERO, ZERO, ZERO, ZERO
-        w, x, y, z = turns[g, 0] * r[9], turns[g, 1] * r[9], turns[g, 2] * r[9], turns[g, 3] * r[9]
+        w, x, y, z = quats[g, 0] * r[9], quats[g, 1] * r[9], quats[g, 2] * r[9], quats[g, 3] * r[9]
         dw, dx, dy, dz = ZERO, ZERO, ZERO, ZERO
         for axis in range(3):
             size, r0, r1, r2 = math.exp(scales[g, axis]), r[axis], r[3 + axis], r[6 + axis]

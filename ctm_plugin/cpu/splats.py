@@ -30,17 +30,20 @@ from ctm_plugin.cpu.splat_projection import (
     project_back,
 )
 
-BROAD, TALL = 8, 32
-"""Pixels of a tile in a row, and rows: of a Gaussian's rows in a tile all pixels are laid, most of them for nothing."""
-PIXELS = BROAD * TALL
-LEAST, MOST = np.float32(1 / 255), np.float32(0.99)
+TILE_WIDTH, TILE_HEIGHT = 8, 32
+"""Pixels of a tile across and down: a Gaussian's rows in a tile are composited whole."""
+TILE_PIXELS = TILE_WIDTH * TILE_HEIGHT
+"""Pixels of a tile."""
+MIN_ALPHA, MAX_ALPHA = np.float32(1 / 255), np.float32(0.99)
+"""Least alpha that counts, and largest alpha (3DGS)."""
 SLACK = np.float32(1e-3)
-"""Of a pixel, by which ellipses are taken for larger: for what rounding takes off."""
-ENOUGH = np.float32(1e-4)
-"""A tile is left when less light than this passes each of its pixels."""
-DEEPEST = np.float32(-8.0)
-"""Below it exp() of an alpha is less than ``LEAST`` at any opacity."""
+"""Pixels by which ellipses are enlarged against rounding."""
+MIN_TRANSMITTANCE = np.float32(1e-4)
+"""A tile is done once the transmittance of all its pixels is below this."""
+MIN_EXPONENT = np.float32(-8.0)
+"""Exponent below which alpha is less than ``MIN_ALPHA`` at any opacity."""
 SIXTEENTH = np.float32(1 / 16)
+"""1 / 16 in float32."""
 _nodes = 0.25 * np.cos(np.pi * (np.arange(6) + 0.5) / 6) - 0.25
 E5, E4, E3, E2, E1, E0 = (np.float32(value) for value in np.polyfit(_nodes, np.exp(_nodes), 5))
 """exp() on [-0.5, 0] to 2e-8: a polynomial makes vectors, the library's function does not."""
@@ -50,10 +53,10 @@ def picture(
     gaussians: tuple[Tensor, ...], camera: tuple, shift: Tensor, degrees: int, floor: float, more: int
 ) -> tuple[Tensor, Tensor]:
     """Do as :func:`ctm_plugin.splats.render.picture`."""
-    return Picture.apply(*gaussians, shift, camera, degrees, floor, more)
+    return Rasterization.apply(*gaussians, shift, camera, degrees, floor, more)
 
 
-class Picture(torch.autograd.Function):
+class Rasterization(torch.autograd.Function):
     """The picture ``[k + more, H, W]`` and what is left of the light ``[H, W]``."""
 
     @staticmethod
@@ -66,7 +69,7 @@ class Picture(torch.autograd.Function):
         basis = torch.empty(count, degrees**2)
         colors = torch.empty(count, k + more)
         project(*tables, shift.detach().contiguous(), numbers, degrees, flat, basis, colors)
-        wide, high = -(-camera.width // BROAD), -(-camera.height // TALL)
+        wide, high = -(-camera.width // TILE_WIDTH), -(-camera.height // TILE_HEIGHT)
         owner, starts, slots, tiles = binned(flat, wide, high)
         image = torch.empty(colors.shape[1], camera.height, camera.width)
         left = torch.empty(camera.height, camera.width)
@@ -117,7 +120,7 @@ def binned(flat: Tensor, wide: int, high: int) -> tuple[Tensor, Tensor, Tensor, 
 @inlined
 def _exp(p):
     """exp() on [-8, 0], and what lies below as if it were -8: of p / 16, squared four times."""
-    q = max(p, DEEPEST) * SIXTEENTH
+    q = max(p, MIN_EXPONENT) * SIXTEENTH
     r = ((((E5 * q + E4) * q + E3) * q + E2) * q + E1) * q + E0
     r = r * r
     r = r * r
@@ -151,17 +154,17 @@ def _span(flat, g, axis, low, high):
 @fused_part
 def _columns(flat, g, row, wide):
     """The first tile, and the one after the last, whose pixels' centres a Gaussian reaches in a row of tiles."""
-    top = np.float32(row * TALL)
-    least, most = _span(flat, g, 0, top + HALF, top + np.float32(TALL) - HALF)
-    first, last = max(_pixel(least - SLACK), 0), min(_pixel(most + SLACK - ONE) + 1, wide * BROAD)
-    return (first // BROAD, (last - 1) // BROAD + 1) if first < last else (0, 0)
+    top = np.float32(row * TILE_HEIGHT)
+    least, most = _span(flat, g, 0, top + HALF, top + np.float32(TILE_HEIGHT) - HALF)
+    first, last = max(_pixel(least - SLACK), 0), min(_pixel(most + SLACK - ONE) + 1, wide * TILE_WIDTH)
+    return (first // TILE_WIDTH, (last - 1) // TILE_WIDTH + 1) if first < last else (0, 0)
 
 
 @fused_part
 def _tile_rows(flat, g, high):
     """The first row of tiles, and the one after the last, that a Gaussian reaches."""
-    first = min(max(math.floor((flat[g, MEAN + 1] - flat[g, EXTENT + 1]) / np.float32(TALL)), 0), high)
-    last = min(max(math.floor((flat[g, MEAN + 1] + flat[g, EXTENT + 1]) / np.float32(TALL)) + 1, 0), high)
+    first = min(max(math.floor((flat[g, MEAN + 1] - flat[g, EXTENT + 1]) / np.float32(TILE_HEIGHT)), 0), high)
+    last = min(max(math.floor((flat[g, MEAN + 1] + flat[g, EXTENT + 1]) / np.float32(TILE_HEIGHT)) + 1, 0), high)
     return first, last
 
 
@@ -204,17 +207,17 @@ def fill_pairs(flat, order, wide, high, starts, at, owner, slots):
 @fused_part
 def _rows(flat, g, left, top):
     """The first of a tile's pixels, and the one after the last, of the rows that a Gaussian reaches there; unsigned."""
-    low, high = _span(flat, g, 1, np.float32(left) + HALF, np.float32(left + BROAD) - HALF)
-    first = min(max(_pixel(low - SLACK) - top, 0), TALL)
-    last = min(max(_pixel(high + SLACK - ONE) + 1 - top, 0), TALL)
-    return np.uint64(first * BROAD), np.uint64(max(first, last) * BROAD)
+    low, high = _span(flat, g, 1, np.float32(left) + HALF, np.float32(left + TILE_WIDTH) - HALF)
+    first = min(max(_pixel(low - SLACK) - top, 0), TILE_HEIGHT)
+    last = min(max(_pixel(high + SLACK - ONE) + 1 - top, 0), TILE_HEIGHT)
+    return np.uint64(first * TILE_WIDTH), np.uint64(max(first, last) * TILE_WIDTH)
 
 
 @fused_part
 def _places(px, py, through, left, top, width, height):
     """Centres of a tile's pixels, and all light before them; none outside the picture."""
-    for i in range(PIXELS):
-        x, y = left + i % BROAD, top + i // BROAD
+    for i in range(TILE_PIXELS):
+        x, y = left + i % TILE_WIDTH, top + i // TILE_WIDTH
         px[i], py[i] = np.float32(x) + HALF, np.float32(y) + HALF
         through[i] = ONE if (x < width and y < height) else ZERO
 
@@ -226,8 +229,8 @@ def _lay(px, py, weight, through, first, last, mx, my, a, b, c, o):
     """
     for i in range(first, last):
         dx, dy = px[i] - mx, py[i] - my
-        alpha = min(o * _exp(a * dx * dx + b * dx * dy + c * dy * dy), MOST)
-        w = alpha * through[i] * np.float32(alpha >= LEAST)
+        alpha = min(o * _exp(a * dx * dx + b * dx * dy + c * dy * dy), MAX_ALPHA)
+        w = alpha * through[i] * np.float32(alpha >= MIN_ALPHA)
         weight[i] = w
         through[i] -= w
 
@@ -245,10 +248,10 @@ def draw(tiles, owner, flat, colors, wide, image, left, ends):
     """Composite each tile's list: ``image`` ``[C, H, W]``, ``left`` ``[H, W]``, ``ends`` where its list was left."""
     channels, height, width = image.shape
     for tile in prange(len(tiles) - 1):
-        x0, y0 = (tile % wide) * BROAD, (tile // wide) * TALL
-        px, py = np.empty(PIXELS, np.float32), np.empty(PIXELS, np.float32)
-        weight, through = np.empty(PIXELS, np.float32), np.empty(PIXELS, np.float32)
-        made = np.zeros((channels, PIXELS), np.float32)
+        x0, y0 = (tile % wide) * TILE_WIDTH, (tile // wide) * TILE_HEIGHT
+        px, py = np.empty(TILE_PIXELS, np.float32), np.empty(TILE_PIXELS, np.float32)
+        weight, through = np.empty(TILE_PIXELS, np.float32), np.empty(TILE_PIXELS, np.float32)
+        made = np.zeros((channels, TILE_PIXELS), np.float32)
         _places(px, py, through, x0, y0, width, height)
         end = tiles[tile + 1]
         for s in range(tiles[tile], tiles[tile + 1]):
@@ -259,15 +262,15 @@ def draw(tiles, owner, flat, colors, wide, image, left, ends):
             _lay(px, py, weight, through, first, last, mx, my, a, b, c, o)
             for channel in range(channels):
                 _add(made[channel], weight, first, last, colors[g, channel])
-            if (s & 15) == 15 and through.max() < ENOUGH:
+            if (s & 15) == 15 and through.max() < MIN_TRANSMITTANCE:
                 end = s + 1
                 break
         ends[tile] = end
-        right, bottom = min(width - x0, BROAD), min(height - y0, TALL)
+        right, bottom = min(width - x0, TILE_WIDTH), min(height - y0, TILE_HEIGHT)
         for y in range(bottom):
-            left[y0 + y, x0 : x0 + right] = through[y * BROAD : y * BROAD + right]
+            left[y0 + y, x0 : x0 + right] = through[y * TILE_WIDTH : y * TILE_WIDTH + right]
             for channel in range(channels):
-                image[channel, y0 + y, x0 : x0 + right] = made[channel, y * BROAD : y * BROAD + right]
+                image[channel, y0 + y, x0 : x0 + right] = made[channel, y * TILE_WIDTH : y * TILE_WIDTH + right]
 
 
 @fused_part
@@ -295,13 +298,13 @@ def _lift(px, py, weight, value, through, behind, first, last, mx, my, a, b, c, 
     for i in range(first, last):
         dx, dy = px[i] - mx, py[i] - my
         raw = o * _exp(a * dx * dx + b * dx * dy + c * dy * dy)
-        alpha = min(raw, MOST)
-        alpha *= np.float32(alpha >= LEAST)
+        alpha = min(raw, MAX_ALPHA)
+        alpha *= np.float32(alpha >= MIN_ALPHA)
         w = alpha * through[i]
         weight[i] = w
         rest = behind[i] - w * value[i]
         behind[i] = rest
-        grad = (through[i] * value[i] - rest / (ONE - alpha)) * alpha * np.float32(raw < MOST)
+        grad = (through[i] * value[i] - rest / (ONE - alpha)) * alpha * np.float32(raw < MAX_ALPHA)
         through[i] -= w
         gx, gy = grad * dx, grad * dy
         m0 += grad
@@ -321,16 +324,16 @@ def draw_back(tiles, owner, flat, colors, wide, image, left, ends, d_image, d_le
     """Write a row of gradients for each pair: mean 2, conic 3, opacity, colours k; front to back once more."""
     channels, height, width = image.shape
     for tile in prange(len(tiles) - 1):
-        x0, y0 = (tile % wide) * BROAD, (tile // wide) * TALL
-        px, py = np.empty(PIXELS, np.float32), np.empty(PIXELS, np.float32)
-        weight, value = np.empty(PIXELS, np.float32), np.empty(PIXELS, np.float32)
-        through, behind = np.empty(PIXELS, np.float32), np.zeros(PIXELS, np.float32)
-        wanted, sums = np.zeros((channels, PIXELS), np.float32), np.empty(6, np.float32)
+        x0, y0 = (tile % wide) * TILE_WIDTH, (tile // wide) * TILE_HEIGHT
+        px, py = np.empty(TILE_PIXELS, np.float32), np.empty(TILE_PIXELS, np.float32)
+        weight, value = np.empty(TILE_PIXELS, np.float32), np.empty(TILE_PIXELS, np.float32)
+        through, behind = np.empty(TILE_PIXELS, np.float32), np.zeros(TILE_PIXELS, np.float32)
+        wanted, sums = np.zeros((channels, TILE_PIXELS), np.float32), np.empty(6, np.float32)
         _places(px, py, through, x0, y0, width, height)
-        right, bottom = min(width - x0, BROAD), min(height - y0, TALL)
+        right, bottom = min(width - x0, TILE_WIDTH), min(height - y0, TILE_HEIGHT)
         for y in range(bottom):
             for x in range(right):
-                i = y * BROAD + x
+                i = y * TILE_WIDTH + x
                 behind[i] = d_left[y0 + y, x0 + x] * left[y0 + y, x0 + x]
                 for channel in range(channels):
                     wanted[channel, i] = d_image[channel, y0 + y, x0 + x]

@@ -7,10 +7,10 @@ import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-WAITING = ("OMP_WAIT_POLICY", "GOMP_SPINCOUNT")
-"""Variables that say how OpenMP's threads wait."""
-SPINS = 1000
-"""Turns of a loop in which a thread waits awake, 20 to 50 us: as long as it takes to wake one."""
+WAIT_VARIABLES = ("OMP_WAIT_POLICY", "GOMP_SPINCOUNT")
+"""Environment variables that set how OpenMP's threads wait."""
+MAX_SPINS = 1000
+"""Turns of the loop in which a thread waits awake, 20 to 50 us: as long as it takes to wake one."""
 
 _loops: list[int] = []
 
@@ -21,16 +21,16 @@ def let_waiting_threads_sleep() -> None:
     By default they wait awake for milliseconds. Where another program has the core of the one that they wait for, they
     take from it what they wait for: a step then takes ten times as long.
     """
-    if not any(name in os.environ for name in WAITING):
-        os.environ["GOMP_SPINCOUNT"] = str(SPINS)
+    if not any(name in os.environ for name in WAIT_VARIABLES):
+        os.environ["GOMP_SPINCOUNT"] = str(MAX_SPINS)
 
 
 def warn_of_neighbours() -> None:
     """Warn where threads wait awake and programs keep all cores busy: of a Python that had torch before us."""
     import torch
 
-    said = any(name in os.environ for name in WAITING)
-    if not said and torch.get_num_threads() > 1 and os.getloadavg()[0] >= (os.cpu_count() or 1):
+    text = any(name in os.environ for name in WAIT_VARIABLES)
+    if not text and torch.get_num_threads() > 1 and os.getloadavg()[0] >= (os.cpu_count() or 1):
         way_out = "start Python with OMP_WAIT_POLICY=passive, as ctm does"
         warnings.warn(
             f"other programs keep all cores busy, and threads that wait slow each other: {way_out}", stacklevel=3

@@ -1,4 +1,4 @@
-"""What a folder of photographs holds, as its files say it: cameras, pictures, and where near and far may come from."""
+"""Contents of a folder of photographs by its files: cameras, pictures, and sources of near and far."""
 
 from __future__ import annotations
 

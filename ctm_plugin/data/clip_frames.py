@@ -1,4 +1,4 @@
-"""Which frames of a clip are worth keeping: the sharpest of each window, windows by how far the picture has moved."""
+"""Choice of a clip's frames: the sharpest of each window, windows of equal movement of the picture."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ MAX_STRIDE = 4
 
 
 class Course(NamedTuple):
-    """What a clip's frames are like.
+    """Sharpness and movement of a clip's frames.
 
     Attributes:
         moved: ``[N]`` how far the picture has moved until each frame, in its longer sides; never less than before.

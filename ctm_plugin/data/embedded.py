@@ -16,7 +16,7 @@ ASSETS = Path(__file__).parent / "assets"
 
 
 class Embedded(EmbeddedSettings):
-    """How to read a scene of the package, a folder of ``ASSETS`` for each light in one of the layouts."""
+    """A scene of the package: a folder of ``ASSETS`` for each light, in one of the layouts."""
 
     scene: ClassVar[str]
     layout: ClassVar[type[FolderConfig]]

@@ -1,4 +1,4 @@
-"""Dark captures whose files list lit pictures of their test views: which picture is which, and who has not noticed."""
+"""Lit references of dark captures: pair test pictures with them; warn if pictures are unpaired."""
 
 from __future__ import annotations
 

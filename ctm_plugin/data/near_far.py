@@ -58,7 +58,7 @@ def near_far(capture: Capture, config: BoundsConfig, views: Sequence[Views]) -> 
 
 
 def given(capture: Capture, config: BoundsConfig, key: str) -> float | None:
-    """What the configuration, else the first file that has it, says of near or far."""
+    """Near or far of the configuration, else of the first file that has it."""
     if (own := getattr(config, key)) is not None:
         return float(own)
     owner = next((record for record in capture.records if key in record), None)

@@ -84,7 +84,8 @@ def model_beside(root: Path, poses: Poses) -> PointsOrReason:
 
 
 def paired(theirs: Sequence[str], ours: Sequence[str]) -> dict[str, str]:
-    """Pair pictures whose paths end alike, as far as no other's does; endings of files and case aside."""
+    """Pair pictures of two files by the longest common ending of their paths, if it is unique; suffixes and case
+    aside."""
 
     def alone(names: Sequence[str]) -> dict[tuple[str, ...], str]:
         ends: dict[tuple[str, ...], list[str]] = {}

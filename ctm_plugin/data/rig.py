@@ -1,4 +1,4 @@
-"""How a capture's cameras stand and look, read without its pictures: what decides the geometry and a film's path."""
+"""Arrangement of a capture's cameras, read without its pictures: it decides the geometry and a film's path."""
 
 from __future__ import annotations
 

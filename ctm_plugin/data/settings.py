@@ -41,7 +41,7 @@ class NoiseConfig(Settings, section="dataset.noise"):
 
 @dataclass(frozen=True, kw_only=True)
 class DimConfig(Settings, section="dataset"):
-    """How dark pictures are made of lit ones."""
+    """Settings that make dark pictures of lit ones."""
 
     exposure: Number = setting(1.0, "factor on the linear light of the pictures; 1: as photographed", above=0, most=1)
     noise: NoiseConfig = setting(NoiseConfig(), "noise of a sensor, added to training views (or patches)")
@@ -54,7 +54,7 @@ class DimConfig(Settings, section="dataset"):
 
 @dataclass(frozen=True, kw_only=True)
 class PhotoConfig(DimConfig):
-    """How photographs become training data."""
+    """Settings that make training data of photographs."""
 
     downscale: Number = setting(
         1, "number, whole or not, that both sides of the pictures are divided by", least=1, most=1e6

@@ -102,7 +102,8 @@ def headers_of(photographs: Sequence[Photograph]) -> list[Header]:
 def on_one_canvas(
     headers: Sequence[Header], config: PhotoConfig, source: Path
 ) -> tuple[PhotoConfig, list[tuple[int, int]], tuple[int, int]]:
-    """How pictures shrink, by one factor for all (``width`` is the widest one's), to what, and what holds each of them.
+    """Factor by which all pictures shrink (``width`` is the widest one's), their sizes then, and the canvas that holds
+    each.
 
     One warning tells of several sizes.
     """

@@ -1,1 +1,1 @@
-"""What makes a GPU fast: Triton kernels; :mod:`ctm_plugin.door` is where functions of other rooms meet them."""
+"""Triton kernels that make a GPU fast; :mod:`ctm_plugin.door` is where functions of other rooms meet them."""

@@ -1,4 +1,4 @@
-"""How kernels are made and launched."""
+"""Making and launching of kernels."""
 
 from __future__ import annotations
 

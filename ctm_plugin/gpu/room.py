@@ -1,4 +1,4 @@
-"""How much a GPU may be given at once."""
+"""Amount of work that a GPU gets at once."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ MAX_SCALE = 16
 
 
 def times_a_chunk(device: torch.device) -> int:
-    """So many chunks fit into its memory where one fits into 8 GiB: few large launches are faster than many small."""
+    """Number of chunks that fit into its memory where one fits into 8 GiB: few large launches are faster."""
     if device.type != "cuda":
         return 1
     return min(max(torch.cuda.get_device_properties(device).total_memory // (BASE_GIBIBYTES << 30), 1), MAX_SCALE)

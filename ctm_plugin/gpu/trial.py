@@ -40,7 +40,7 @@ def _apart(one: Tensor, other: Tensor) -> float:
 
 
 def _results(run: Callable, arguments: tuple) -> list[Tensor]:
-    """What it returns, its arguments afterwards, and gradients."""
+    """Results of a kernel, its arguments afterwards, and gradients."""
     results, given = list(_leaves([run(*arguments)])), list(_leaves(arguments))
     wanted = [each for each in given if each.requires_grad]
     if wanted:

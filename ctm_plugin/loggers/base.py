@@ -1,4 +1,4 @@
-"""What a run tells its logger: curves by Lightning's own methods, and what Lightning has no method for."""
+"""A run's calls to its logger: Lightning's own methods, and those that Lightning has not."""
 
 from __future__ import annotations
 

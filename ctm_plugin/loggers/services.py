@@ -1,4 +1,4 @@
-"""Where curves and pictures go: Lightning's own loggers, with a run's folder and the step that it goes on from."""
+"""Lightning's own loggers, with a run's folder and the step that it resumes from."""
 
 from __future__ import annotations
 

@@ -9,7 +9,7 @@ from ctm_plugin.settings.setting import Settings, setting
 
 @dataclass(frozen=True, kw_only=True)
 class WandBConfig(Settings, section="logger"):
-    """Where runs go."""
+    """Project and mode of Weights & Biases."""
 
     project: str = setting("ctm_plugin", "project that runs are put into")
     mode: str = setting(

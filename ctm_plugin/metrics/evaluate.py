@@ -1,4 +1,4 @@
-"""How test views are scored: all scores of a test set, or of aligned patches, as one plain dict, ready for JSON."""
+"""Scores of a test set, or of aligned patches, as one plain dict, ready for JSON."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ Depths = Float[Tensor, "n h w"] | Sequence[Float[Tensor, "h w"]]
 
 @dataclass(frozen=True)
 class Scoring:
-    """What a backbone is handed to score itself with.
+    """Metrics, data settings and light that a backbone scores itself with.
 
     Attributes:
         dataset: the data set's part of the run's configuration, for the protocol.

@@ -1,4 +1,4 @@
-"""Where LPIPS' weights come from: the heads out of torchmetrics' package, the network out of a file or by torch.hub."""
+"""LPIPS' weights: the heads out of torchmetrics' package, the network out of a file or by torch.hub."""
 
 from __future__ import annotations
 

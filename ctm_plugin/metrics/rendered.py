@@ -1,4 +1,4 @@
-"""What metrics compare: a rendered view with its picture, patches with where they belong."""
+"""Inputs of metrics: a rendered view with its picture, patches with their true place."""
 
 from __future__ import annotations
 

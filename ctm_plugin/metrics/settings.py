@@ -10,7 +10,7 @@ from ctm_plugin.settings.setting import Settings, setting
 
 @dataclass(frozen=True, kw_only=True)
 class MetricsConfig(Settings, section="metrics"):
-    """How test views are scored."""
+    """Scores of test views."""
 
     lpips_weights: str | Path | None = setting(
         None, "file (.npz or .pth) with AlexNet's or VGG's convolutions; null: torch.hub's cache, else a download"

@@ -15,7 +15,7 @@ class Turn(NamedTuple):
 
 
 class Pace:
-    """Where in its schedule a training is.
+    """Position of a training in its schedule.
 
     The schedule has ``planned`` steps, of which learning rates and other settings know; a training follows it in more
     steps or fewer. Between turns it goes on evenly: at step s, of the turn (s0, p0, end) before it,

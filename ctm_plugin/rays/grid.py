@@ -208,7 +208,7 @@ def resample(table: Float[Tensor, "v c"], old: Shape, new: Shape) -> Float[Tenso
 
 
 def _places(old: int, new: int) -> tuple[Tensor, Tensor]:
-    """Where the new vertices of a side lie: after which old one, and how far towards the next."""
+    """Positions of a side's new vertices: the old one before, and the share of the way to the next."""
     place = torch.arange(new, dtype=torch.float64) * ((old - 1) / (new - 1))
     low = place.floor().clamp_(max=old - 2)
     return low.long(), (place - low).float()

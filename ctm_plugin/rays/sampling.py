@@ -1,4 +1,4 @@
-"""Where along the rays a field is evaluated."""
+"""Distances along rays at which a field is evaluated."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""Finished runs, gathered into the paper's tables and figures."""
+"""Finished runs, gathered into the paper's tables."""

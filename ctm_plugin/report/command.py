@@ -1,4 +1,4 @@
-"""Finished runs as tables or a figure."""
+"""Finished runs as tables."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from ctm_plugin.report.text import FORMATS
 
 
 def report(*runs: Path, settings: ReportConfig) -> None:
-    """Read runs, given as their directories or as folders of them, and write tables or a figure.
+    """Read runs, given as their directories or as folders of them, and write tables.
 
     The first table has all runs, named by the settings in which they differ. Runs without scores are listed, with why.
 
@@ -27,13 +27,7 @@ def report(*runs: Path, settings: ReportConfig) -> None:
         print(f"left out: {why}", file=sys.stderr)
     if not group.runs:
         raise CTMError(f"{runs[0]}: found {len(group.left_out)} runs, none of them finished and whole, expected scores")
-    if settings.figure:
-        from ctm_plugin.report.figures import draw
-
-        for path in draw(settings.figure, group.runs, out or Path(f"figure_{settings.figure}")):
-            print(f"written to {path}")
-        return
-    elif asked == "html":
+    if asked == "html":
         from ctm_plugin.report.page import page
 
         out = out or Path("report.html")

@@ -19,11 +19,6 @@ class ReportConfig(Settings):
         None,
         "name of the paper's data set whose values are shown next to runs of other data, such as Synthetic-NeRF-Dark",
     )
-    figure: str | None = setting(
-        None,
-        "figure of the paper to draw instead of a table: 3 to 8, or C (appendix C's variances)",
-        choices=("3", "4", "5", "6", "7", "8", "C"),
-    )
     format: str = setting(
         "md",
         "format of tables: md, csv, latex or html",
@@ -31,7 +26,7 @@ class ReportConfig(Settings):
     )
     out: str | None = setting(
         None,
-        "file to write, for figures without ending; null: standard output, report.html for html, figure_N for figures",
+        "file to write; null: standard output, report.html for html",
     )
 
     def __post_init__(self) -> None:

@@ -27,7 +27,7 @@ from ctm_plugin.settings.registry import APPEARANCES, BACKBONES, CALLBACKS, COLO
 
 @dataclass
 class Parts:
-    """What a run is made of."""
+    """Objects that a run consists of."""
 
     scene: Any
     backbone: Backbone

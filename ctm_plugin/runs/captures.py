@@ -38,7 +38,7 @@ class Dots(NamedTuple):
 
 
 class Sights(NamedTuple):
-    """Which points a picture shows: their rows ``[T]``, where in pixels ``[T, 2]``, and its colours there."""
+    """Points that a picture observes: their rows ``[T]``, positions in pixels ``[T, 2]``, and its colours there."""
 
     rows: np.ndarray
     places: np.ndarray
@@ -162,7 +162,7 @@ def frame_of(shot: CapturedView, masked: bool) -> dict[str, Any]:
 
 
 def seen(points: Points, views: Views, index: int, image: Pixels) -> Sights:
-    """What a training view sees of the points that are known to be in it, and what its picture shows there."""
+    """Observations of a training view: the points known to be in it, and its colours there."""
     rows = points.point[points.view == index]
     column, row, _, there = projected(points.positions[rows].double(), views, index)
     rows, places = rows[there], torch.stack([column, row], 1)[there]

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import hydra
-from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import ChoiceSweep, Override
 from hydra.errors import HydraException, MissingConfigException
 from omegaconf import DictConfig, OmegaConf
@@ -20,7 +19,7 @@ from ctm_plugin.errors import ConfigError, DataError, printable
 from ctm_plugin.runs.checks import checked
 from ctm_plugin.runs.choices import GROUPS, normalise, register, with_fitting_dataset, with_usual_backbone
 from ctm_plugin.scene.kinds import AUTO
-from ctm_plugin.settings.as_typed import is_sweep
+from ctm_plugin.settings.as_typed import grammar, is_sweep
 from ctm_plugin.settings.build import SECTIONS, unknown_choice, unknown_key
 from ctm_plugin.settings.listing import names
 from ctm_plugin.settings.registry import REGISTRIES, conf_dir
@@ -86,10 +85,11 @@ def check(arguments: Sequence[str]) -> list[str]:
 
 def check_values(config: DictConfig, arguments: Sequence[str]) -> None:
     """Refuse keys and values that one run cannot use, and several values where there is no sweep."""
-    settings = without_hydras(config, "bounded")  # the sizes that depend on it are all allowed
-    if not is_sweep(arguments):
-        checked(settings)
-        refuse_several(arguments)
+    if not elsewhere(arguments):
+        settings = without_hydras(config, "bounded")  # the sizes that depend on it are all allowed
+        if not is_sweep(arguments):
+            checked(settings)
+    refuse_several(arguments)
 
 
 def at_work(folder: str | Path | None = None) -> AbstractContextManager[None]:
@@ -118,7 +118,7 @@ def refuse_several(arguments: Sequence[str]) -> None:
 def parsed(arguments: Iterable[str]) -> list[Override]:
     """Read those of a command line's arguments that are no flags, nor what belongs to a flag."""
     given = (each for each in arguments if each.startswith("~") or ("=" in each and not each.startswith("-")))
-    return OverridesParser.create().parse_overrides(list(given))
+    return grammar().parse_overrides(list(given))
 
 
 def composed(arguments: Sequence[str], name: str = "config", whole: bool = False) -> DictConfig:
@@ -159,14 +159,14 @@ def check_choices(arguments: Sequence[str]) -> None:
     Raises:
         ConfigError: there is such a value.
     """
-    parser, known_here = OverridesParser.create(), not elsewhere(arguments)
+    known_here = not elsewhere(arguments)
     folders = {path.stem for path in conf_dir().iterdir()}  # such as budget, which nobody needs to name
     for argument in arguments:
         key, equals, value = argument.partition("=")
         if not equals or argument.startswith("-"):
             continue
         try:
-            given = parser.parse_override(argument)
+            given = grammar().parse_override(argument)
         except HydraException as error:
             why = str(error).partition("\n")[0]
             raise ConfigError(key, value, f"a value that can be read ({why})") from error

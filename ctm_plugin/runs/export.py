@@ -1,4 +1,4 @@
-"""What a run found, for other programs: splats, points, a mesh, depth, cameras, lit pictures; and a page for people."""
+"""A run for other programs: splats, points, a mesh, depth, cameras, lit pictures; and a page for people."""
 
 from __future__ import annotations
 

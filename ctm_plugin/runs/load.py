@@ -61,7 +61,7 @@ class LoadedRun:
 
     @cached_property
     def light(self) -> Light:
-        """What its pictures are shown in by default."""
+        """Light in which its pictures are displayed by default."""
         return self.module.light
 
     def render(

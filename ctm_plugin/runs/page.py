@@ -60,7 +60,7 @@ class PageView(NamedTuple):
     """A test view as data URLs: lit; the photograph as it was, and in the same light, where there is one."""
 
     name: str
-    lit_view: str
+    lit: str
     taken: str | None
     photo: str | None
 

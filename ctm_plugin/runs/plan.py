@@ -1,4 +1,4 @@
-"""How wide pictures are trained on, and with which budget, so that splats are ready in time: by timing real steps."""
+"""Width of training pictures and budget by which splats are ready in time, by timing real steps."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ REFERENCE = Timed(0.04, 300 * 225)
 
 
 class Plan(NamedTuple):
-    """What is trained on, and a line on it, which may be empty."""
+    """Width and budget of a training, and a line on them, which may be empty."""
 
     width: int
     budget: str

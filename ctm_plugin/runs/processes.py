@@ -70,7 +70,7 @@ def processes(run: Path, count: int) -> Iterator[None]:
 
 
 def _failure(others: list[subprocess.Popen], seconds: float) -> str | None:
-    """Which process failed, if one does within so many seconds."""
+    """The process that failed, if one does within so many seconds."""
     until = time.monotonic() + seconds
     while True:
         for rank, process in enumerate(others, start=1):

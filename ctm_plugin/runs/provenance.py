@@ -1,4 +1,4 @@
-"""Where a result comes from: data, versions, code."""
+"""Origin of a result: data, versions, code."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def versions() -> dict[str, str]:
 
 
 def device_name(device: torch.device) -> str:
-    """What a device is called: ``CPU``, or the GPU's model."""
+    """Name of a device: ``CPU``, or the GPU's model."""
     return torch.cuda.get_device_name(device) if device.type == "cuda" else device.type.upper()
 
 

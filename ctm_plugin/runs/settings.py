@@ -96,19 +96,19 @@ class DataFolder(Settings, section="dataset"):
 
 @dataclass(frozen=True, kw_only=True)
 class RunConfig(Settings):
-    """What can be said of a run that is read again."""
+    """Settings of a run that is read again."""
 
     dataset: DataFolder = DataFolder()
 
 
 @dataclass(frozen=True, kw_only=True)
 class LitConfig(LightConfig, RunConfig):
-    """What is shown as bright as in normal light."""
+    """Settings of a run whose pictures are shown as bright as in normal light."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ExportConfig(LitConfig):
-    """What to write, and how fine."""
+    """Kind and resolution of an export."""
 
     what: str | None = setting(
         None,
@@ -136,7 +136,7 @@ class ExportConfig(LitConfig):
 
 @dataclass(frozen=True, kw_only=True)
 class VideoConfig(LitConfig):
-    """What to show."""
+    """Path and pictures of a film."""
 
     light: str | None = setting(
         None,

@@ -55,7 +55,7 @@ PROPERTIES[PROPERTIES.index("opacity_0")] = "opacity"
 
 
 def plain(module: Splat, light: Light, steps: int, sided: bool = True, every: int = 1) -> Gaussians:
-    """Train colours in RGB, and opacities, until they show what the run's own pictures do.
+    """Train RGB colours and opacities to reproduce the run's own pictures.
 
     Colours that are decoded one by one show something else: decoding and blending do not commute.
 

@@ -1,4 +1,4 @@
-"""Where a field's matter begins: a cloud of points that its training views see, or a mesh."""
+"""Surface of a field: a cloud of points that its training views see, or a mesh."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class Surface(NamedTuple):
 
 
 def stopped(module: PosedBackbone, points: Float[Tensor, "m 3"], length: Tensor | float) -> Float[Tensor, " m"]:
-    """How much light a length of what lies at points ``[M, 3]`` stops, ``[M]``: ``1 - exp(-density length)``."""
+    """Opacity ``[M]`` of a length of what lies at points ``[M, 3]``: ``1 - exp(-density length)``."""
     axis = torch.tensor([0.0, 0.0, -1.0], device=points.device).expand_as(points)
     density = torch.cat([module.query(*part)[0] for part in zip(points.split(POINTS), axis.split(POINTS), strict=True)])
     return -torch.expm1(-density * length)
@@ -72,7 +72,7 @@ def spanned(points: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:
 
 @torch.no_grad()
 def cloud(module: PosedBackbone, max_points: int, opaque: float) -> Surface:
-    """What the training views see: where their rays end, in the colours that they have there.
+    """End points of the training views' rays, in the colours that they have there.
 
     Normals are the density's, or of a backbone that does not tell it what neighbouring rays' ends say.
 

@@ -1,1 +1,1 @@
-"""What a field is trained on, whatever files it came from."""
+"""A field's training data, whatever files they came from."""

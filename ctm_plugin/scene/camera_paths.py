@@ -117,7 +117,7 @@ def eased(times: Float64[np.ndarray, " n"]) -> Float64[np.ndarray, " n"]:
 
 
 def _lengths(centres: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, " n"]:
-    """How far along the line through them each lies, from 0 to 1; evenly where all are at one place."""
+    """Arc length of each point along the polyline through them, from 0 to 1; evenly where all are at one place."""
     steps = np.linalg.norm(np.diff(centres, axis=0), axis=1)
     whole = steps.sum()
     return np.linspace(0.0, 1.0, len(centres)) if whole == 0 else np.append(0.0, steps.cumsum()) / whole

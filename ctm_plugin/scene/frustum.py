@@ -1,5 +1,4 @@
-"""What cameras see of space: boxes round their frusta, how many see a point, the hull of what they show, and the
-frustum of all as a cube."""
+"""Space that cameras see: boxes round their frusta, visibility of points, the visual hull, and NDC's cube."""
 
 from __future__ import annotations
 
@@ -60,7 +59,7 @@ def ray_box(rays: Rays, near: float, far: float) -> Float[Tensor, "2 3"]:
 
 
 def view_counts(points: Float[Tensor, "p 3"], views: Views, near: float) -> tuple[Tensor, Tensor]:
-    """How many cameras see each point, and whether any camera is nearer to it than ``near``.
+    """Number of cameras that see each point, and whether any camera is nearer to it than ``near``.
 
     A camera sees a point that projects into its image and is in front of it.
 
@@ -109,7 +108,7 @@ def visual_hull(points: Float[Tensor, "p 3"], views: Views, radius: float) -> Bo
 
 
 def reach(square: Float[Tensor, " p"], depth: Float[Tensor, " p"], radius: float) -> Float[Tensor, " p"]:
-    """How far from its middle a ball's picture goes, in focal lengths, where it goes furthest: away from the axis.
+    """Largest distance of a ball's picture from its middle, in focal lengths: away from the axis.
 
     ``tan(a + b) - tan a``, a the middle's angle from the axis and ``sin b = radius / distance``; infinite where the
     ball reaches past the camera.

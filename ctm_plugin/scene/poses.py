@@ -81,7 +81,7 @@ def mean_pose(c2w: Float64[np.ndarray, "n 3 4"]) -> Float64[np.ndarray, "3 4"]:
 
 
 class Similarity(NamedTuple):
-    """How one world lies in another: ``p -> scale turn p + shift``, and how well cameras agree on it.
+    """Map from one world to another: ``p -> scale turn p + shift``, and how well cameras agree on it.
 
     Attributes:
         off: the largest distance between cameras, as a part of the spread of all (root mean square).

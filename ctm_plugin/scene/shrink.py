@@ -54,7 +54,7 @@ def area_of_rows(image: Float32[Tensor, "h w c"], height: int) -> Float32[Tensor
 
 
 def shrink_mask(mask: Bool[Tensor, "h w"], height: int, width: int) -> Bool[Tensor, "h2 w2"]:
-    """Which larger pixels count: those that lie whole in what counts."""
+    """Larger pixels that count: those that lie whole in what counts."""
     return area(mask[..., None].float(), height, width)[..., 0] > FULL_COVERAGE
 
 

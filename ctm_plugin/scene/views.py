@@ -1,4 +1,4 @@
-"""What loaders return: a :class:`Scene` with two sets of posed :class:`Views`, or a :class:`PlanarScene`."""
+"""Results of loaders: a :class:`Scene` with two sets of posed :class:`Views`, or a :class:`PlanarScene`."""
 
 from __future__ import annotations
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import os
 import re
 from collections.abc import Iterable, Iterator
@@ -21,6 +22,12 @@ HYDRA_FOLDERS = ("hydra.run.dir", "hydra.sweep.dir", "hydra.sweep.subdir")
 """Keys of Hydra's own folders, which it does not sweep."""
 HYDRA_VALUES = re.compile(r"null|(?P<quote>['\"]).*(?P=quote)|(choice|glob|shuffle|sort|tag|str)\(.*\)", re.DOTALL)
 """Pattern of values that Hydra reads itself, unless a file has such a name."""
+
+
+@functools.cache
+def grammar() -> OverridesParser:
+    """Hydra's, in which every ``key=value`` is read."""
+    return OverridesParser.create()
 
 
 def is_sweep(arguments: Iterable[str]) -> bool:
@@ -63,7 +70,7 @@ def bare(text: str) -> list[str]:
     """What a value names, without the quotes of Hydra's grammar; several where it has a choice of them."""
     if not HYDRA_VALUES.fullmatch(text) or _is_there(text):
         return [text]
-    value = OverridesParser.create().parse_override(f"key={text}").value()
+    value = grammar().parse_override(f"key={text}").value()
     named = [getattr(each, "text", each) for each in (value.list if isinstance(value, ChoiceSweep) else [value])]
     return named if all(isinstance(each, str) for each in named) else [text]
 
@@ -72,7 +79,7 @@ def _quoted(text: str) -> str:
     if HYDRA_VALUES.fullmatch(text) and not _is_there(text):
         return text
     with suppress(HydraException):
-        if OverridesParser.create().parse_override(f"key={text}").value() == text:
+        if grammar().parse_override(f"key={text}").value() == text:
             return text
     return QuotedString(text, Quote.single).with_quotes()
 

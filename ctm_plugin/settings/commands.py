@@ -93,7 +93,7 @@ VERBS = {
         "ctm_plugin.view.settings:ViewConfig",
     ),
     "report": Verb(
-        "make tables and figures of finished runs, with the paper's values", "RUNS ...",
+        "make tables of finished runs, with the paper's values", "RUNS ...",
         "ctm_plugin.report.command:report", "ctm_plugin.report.settings:ReportConfig",
     ),
     "list": Verb(

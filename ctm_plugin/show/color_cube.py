@@ -1,4 +1,4 @@
-"""What a colour transform makes of the colours, as a picture."""
+"""Picture of what a colour transform does to the colours."""
 
 from __future__ import annotations
 
@@ -66,6 +66,6 @@ def dots(places: Float[Tensor, "n 3"], colors: Float[Tensor, "n 3"]) -> Float[Te
 
 
 def _seen(points: Float[Tensor, "n 3"]) -> Float[Tensor, "n 2"]:
-    """Where points of the unit cube are in the picture, in pixels."""
+    """Positions in the picture, in pixels, of points of the unit cube."""
     centred = points - 0.5
     return PICTURE_SIDE * (0.5 + 0.6 * torch.stack([centred @ RIGHT, -(centred @ UP)], dim=1))

@@ -1,4 +1,4 @@
-"""What a person reads in the terminal: a short table at the end of a run or a sweep, nothing of the libraries' own."""
+"""Tables in the terminal: a short one at the end of a run or a sweep."""
 
 from __future__ import annotations
 

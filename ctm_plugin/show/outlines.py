@@ -1,4 +1,4 @@
-"""Where patches lie in a picture, drawn on it."""
+"""Outlines of patches, drawn on a picture."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a field looks like in the middle of its training: one small rendering, and what it should look like."""
+"""Snapshot of a field in training: one small rendering, and its target."""
 
 from __future__ import annotations
 

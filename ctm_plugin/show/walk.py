@@ -39,7 +39,7 @@ class Spots(NamedTuple):
 
 
 class Start(NamedTuple):
-    """Where a walk begins: the eye, what it looks at, which way is up, and the vertical field of view in radians."""
+    """First camera of a walk: the eye, what it looks at, which way is up, and the vertical field of view in radians."""
 
     eye: Float[np.ndarray, " 3"]
     ahead: Float[np.ndarray, " 3"]

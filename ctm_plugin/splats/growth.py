@@ -21,7 +21,7 @@ SPLIT_FACTOR = 1.6
 
 
 class Change(NamedTuple):
-    """Which Gaussians stay, by index, and what comes after them."""
+    """Indices of the Gaussians that stay, and the ones added after them."""
 
     kept: Int[Tensor, " m"]
     added: Gaussians

@@ -37,7 +37,7 @@ def with_plane(projected: ProjectedGaussians, camera: Camera) -> Tensor:
 def picture(
     gaussians: Gaussians, camera: Camera, shift: Tensor, degrees: int, floor: float, more: int
 ) -> tuple[Tensor, Tensor]:
-    """Render Gaussians over nothing.
+    """Render Gaussians without a background.
 
     A pixel p gets ``sum_i c_i alpha_i T_i``, front to back by depth, with ``alpha_i = o_i exp(-q / 2)``, q the squared
     distance of p from the mean under the conic, at most 0.99 and 0 below 1/255, and ``T_i`` the product of all

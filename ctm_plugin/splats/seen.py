@@ -1,4 +1,4 @@
-"""What cameras see of Gaussians: how many pixels each of them makes, how often, and how wide it is at least."""
+"""Visibility of Gaussians: how many pixels each of them makes, in how many cameras, and its least width."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from ctm_plugin.splats.start import SH_C0
 
 
 def pixels_made(gaussians: Gaussians, cameras: Sequence[Camera]) -> Float[Tensor, " n"]:
-    """How many pixels each Gaussian makes in a mean picture: the sum of its ``alpha_i T_i``, see
-    :func:`~ctm_plugin.splats.render.picture`; 0 of what no camera sees.
+    """Pixels that each Gaussian makes in a mean picture: the sum of its ``alpha_i T_i``, see
+    :func:`~ctm_plugin.splats.render.picture`; 0 where no camera sees it.
 
     Pictures are linear in colours, so that is the gradient of the sum of a grey one.
     """
@@ -28,7 +28,7 @@ def pixels_made(gaussians: Gaussians, cameras: Sequence[Camera]) -> Float[Tensor
 
 
 def times_seen(places: Float[Tensor, "n 3"], cameras: Sequence[Camera]) -> Int64[Tensor, " n"]:
-    """How many cameras have each place in their pictures, as pinholes, whether or not something hides it."""
+    """Number of cameras with each point in their pictures, as pinholes, whether or not something hides it."""
     times = torch.zeros(len(places), dtype=torch.long, device=places.device)
     for camera in cameras:
         x, y, z = ((places - camera.centre) @ camera.turn.T).unbind(1)

@@ -1,4 +1,4 @@
-"""Where Gaussians begin: at a reconstruction's points, at random places in view where it has few or none."""
+"""Initial Gaussians: at a reconstruction's points, at random points in view where it has few or none."""
 
 from __future__ import annotations
 

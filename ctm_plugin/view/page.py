@@ -39,7 +39,7 @@ MAX_SECONDS = 600.0
 
 
 class Page:
-    """What a client sees, from the first test view on.
+    """Page of one client, from the first test view on.
 
     Args:
         client: whose.
@@ -77,7 +77,7 @@ class Page:
         self._place(views[0])
 
     def _picture_controls(self, gui: viser.GuiApi, runs: Sequence[str], light: Light) -> list[viser.GuiInputHandle]:
-        """Which run, which picture of it, and what stands next to it."""
+        """Controls of the run, its kind of picture, and the picture next to it."""
         scene, several = self._scene, len(runs) > 1
         self.run = gui.add_dropdown("run", runs, visible=several)
         self.kind = gui.add_dropdown("picture", tuple(LABELS))
@@ -137,7 +137,7 @@ class Page:
         return [self.size, self.seconds]
 
     def _space_controls(self, client: viser.ClientHandle) -> list[viser.GuiInputHandle]:
-        """What is behind the scene, and a crop box along the world's axes."""
+        """Controls of the background, and of a crop box along the world's axes."""
         colour = (255, 255, 255) if self._scene.background == "white" else (0, 0, 0)
         with client.gui.add_folder("background and crop", expand_by_default=False):
             self.background = client.gui.add_rgb("background", colour)
@@ -150,7 +150,7 @@ class Page:
         return [self.background, self.cropped, *self.sides]
 
     def look(self) -> Look | None:
-        """What the controls and the camera say; ``None`` while they make no sense."""
+        """The look that the controls and the camera ask for; ``None`` while they are invalid."""
         camera, beside = camera_of(self._client), self.beside.value
         if camera is None:
             return None
@@ -165,7 +165,7 @@ class Page:
 
     @property
     def limit(self) -> Limit:
-        """What the controls say; a number that is just being typed may be beyond its range."""
+        """The limit that the controls ask for; a number that is just being typed may be beyond its range."""
         size, seconds = int(self.size.value), float(self.seconds.value)
         return Limit(min(max(size, SIDES[0]), SIDES[1]), min(max(seconds, 0.1), MAX_SECONDS))
 
@@ -222,6 +222,6 @@ def legend(scene: Scene) -> np.ndarray:
 
 
 def mark_size(views: Sequence[PhotographSource]) -> float:
-    """How large cameras are drawn, in scene units."""
+    """Size of drawn cameras, in scene units."""
     eyes = np.array([view.camera.position for view in views])
     return FRUSTUM_SIZE * (float(np.sqrt(((eyes - eyes.mean(0)) ** 2).sum(1).mean())) or 1.0)

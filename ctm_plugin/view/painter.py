@@ -1,4 +1,4 @@
-"""What clients look at, and pictures of it that get finer while nobody moves, by one painter for all of them."""
+"""Pictures for clients that get finer while nobody moves, by one painter for all of them."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class Viewpoint(NamedTuple):
 
 
 class Look(NamedTuple):
-    """What a client looks at: a run or a photograph, or the left and the right one from one camera.
+    """Request of a client: a run or a photograph, or the left and the right one from one camera.
 
     Attributes:
         sources: ``render(shot, height, width, check)`` gives whatever ``picture(rendered, kind, light)`` makes a
@@ -100,7 +100,7 @@ class Renderings:
 
 
 class Limit(NamedTuple):
-    """How fine a client's last picture becomes: its longer side in pixels, and the seconds that it may take."""
+    """Limits of a client's last picture: its longer side in pixels, and its seconds."""
 
     finest: int = 1024
     seconds: float = 10.0
@@ -203,7 +203,7 @@ class Painter:
         return min(left, key=lambda each: each[1].size, default=None)
 
     def _finish(self, task: Task, seconds: float) -> None:
-        """What follows a picture: a finer one, as fine as the limits allow."""
+        """Paint finer pictures after one, up to the limits."""
         with self._changed:
             self._speed = task.size**2 / max(seconds, 1e-6)  # pictures have other shapes, but the same before and after
             finest = task.limit.finest

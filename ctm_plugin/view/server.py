@@ -146,7 +146,7 @@ def check_free(host: str, port: int) -> None:
 
 
 def page_address(host: str, port: int, token: str | None) -> str:
-    """What to type into a browser: this machine's name where it listens at all of its addresses."""
+    """Address of the page: this machine's name where the server listens at all of its addresses."""
     name = socket.gethostname() if host in ("0.0.0.0", "::") else f"[{host}]" if ":" in host else host
     return f"http://{name}:{port}/" + (f"?token={token}" if token else "")
 

@@ -10,7 +10,7 @@ from ctm_plugin.settings.setting import setting
 
 @dataclass(frozen=True, kw_only=True)
 class ViewConfig(LitConfig):
-    """Where to listen, and in which light to begin."""
+    """Address and first light of the viewer."""
 
     port: int = setting(8080, "port of the page", least=1, most=65535)
     host: str = setting(

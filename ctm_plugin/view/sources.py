@@ -1,4 +1,4 @@
-"""What there is to look at: runs, finished or still in training, and photographs seen from the browser's camera."""
+"""Sources of pictures: runs, finished or still in training, and photographs seen from the browser's camera."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ class Subject:
 
     @torch.no_grad()
     def render(self, shot: Viewpoint, height: int, width: int, check: Callable[[], None]) -> Rendered:
-        """What :meth:`ctm_plugin.runs.load.LoadedRun.picture` needs, on the CPU, ``[H, W, ...]``.
+        """Tensors that :meth:`ctm_plugin.runs.load.LoadedRun.picture` needs, on the CPU, ``[H, W, ...]``.
 
         Of a crop box: rays begin where they enter it, and those that end behind it, by their expected depth, show the
         background; so do rays that miss it. In normalised device coordinates all rays begin at the near plane, and in

@@ -52,8 +52,8 @@ def view_gradients(mlp, features, directions, ray, way):
 @pytest.mark.parametrize("samples", [0, 1, 8, 21])
 @pytest.mark.parametrize("way", ["blocks", "module"])
 def test_view_mlp_is_the_whole(samples, way, monkeypatch):
-    monkeypatch.setattr(blocked_mlp, "BLOCK", 11 * 24 * 4)  # of the widest layer, the entry: whole strides of it
-    monkeypatch.setattr(blocked_mlp, "STRIDE", 4)
+    monkeypatch.setattr(blocked_mlp, "BLOCK_BYTES", 11 * 24 * 4)  # of the widest layer, the entry: whole strides of it
+    monkeypatch.setattr(blocked_mlp, "ROW_MULTIPLE", 4)
     mlp = ViewMLP(FEATURES, 3, width=8, depth=3, frequencies=2)
     features, directions = torch.randn(samples, FEATURES), directions_of(5)
     ray = torch.randint(5, (samples,)).sort().values

@@ -43,8 +43,8 @@ def whole(image: NeuralImage, points: torch.Tensor, shown: torch.Tensor | None) 
 @pytest.mark.parametrize("rows", [1, 7, 8, 20])
 @pytest.mark.parametrize("shown", [None, [1.0, 1.0, 0.5, 0.0]])
 def test_blocks_are_the_whole(image, monkeypatch, rows, shown):
-    monkeypatch.setattr(blocked_mlp, "BLOCK", 8 * 24 * 8)  # eight rows of the widest layer, the entry
-    monkeypatch.setattr(blocked_mlp, "STRIDE", 4)
+    monkeypatch.setattr(blocked_mlp, "BLOCK_BYTES", 8 * 24 * 8)  # eight rows of the widest layer, the entry
+    monkeypatch.setattr(blocked_mlp, "ROW_MULTIPLE", 4)
     points = torch.rand(rows, 2, dtype=torch.float64) * 2 - 1
     shown = None if shown is None else torch.tensor(shown, dtype=torch.float64)
     for a, b in zip(*both(image, points, shown), strict=True):
@@ -76,8 +76,8 @@ def test_gradients(image):
 
 
 def test_without_gradients_nothing_is_kept(image, monkeypatch):
-    monkeypatch.setattr(blocked_mlp, "BLOCK", 8 * 24 * 8)  # eight rows of the widest layer, the entry
-    monkeypatch.setattr(blocked_mlp, "STRIDE", 4)
+    monkeypatch.setattr(blocked_mlp, "BLOCK_BYTES", 8 * 24 * 8)  # eight rows of the widest layer, the entry
+    monkeypatch.setattr(blocked_mlp, "ROW_MULTIPLE", 4)
     points = torch.rand(20, 2, dtype=torch.float64)
     with torch.no_grad():
         assert torch.equal(image(points), image(points))  # the same call twice

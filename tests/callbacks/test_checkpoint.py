@@ -99,6 +99,18 @@ def test_a_signal_between_two_steps_ends_the_run_after_the_next(tmp_path):
     assert last.steps == [4]
 
 
+@pytest.mark.parametrize(("batch", "validated"), [(3, [2]), (4, [2, 4])])
+def test_a_stop_validates_no_more_than_is_due(tmp_path, batch, validated):
+    seen, look = [], L.Callback()
+    look.on_validation_end = lambda trainer, *_: seen.append(trainer.global_step)
+    callbacks = [Signal("on_train_batch_end", batch), look, last := Recorded(tmp_path, 100)]
+    often = {"limit_val_batches": 1, "val_check_interval": 2, "check_val_every_n_epoch": None}
+    with last.listening():
+        trainer(7, *callbacks, num_sanity_val_steps=0, **often).fit(Toy(7, small_ctm()))
+    assert last.steps == [batch]
+    assert seen == validated
+
+
 @pytest.mark.parametrize("hook", ["setup", "on_fit_start", "on_train_start"])
 def test_a_signal_before_the_first_step_ends_the_run(tmp_path, hook):
     early = L.Callback()

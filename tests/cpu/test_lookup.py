@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ctm_plugin.cpu import lookup
-from ctm_plugin.cpu.lookup import BLOCK, OWNED, add_rows, numbers_at, sums_of_rows
+from ctm_plugin.cpu.lookup import LOG2_OWNED_ROWS, ROW_BLOCK, add_rows, numbers_at, sums_of_rows
 from ctm_plugin.rays.grid import VoxelGrid, scattered
 
 SHAPE = (21, 22, 23)
@@ -23,8 +23,8 @@ def corners_and_gradient(points: int, channels: int, seed: int) -> tuple[torch.T
 @given(st.integers(0, 3000), st.sampled_from([1, 3, 12]), st.integers(0, 10**6))
 def test_a_scatter(points, channels, seed):
     """Rows alone or the whole table are to the bit the same: one loop, which fuses nothing, in the points' order."""
-    assert COUNT > 2 * BLOCK
-    assert COUNT >> OWNED
+    assert COUNT > 2 * ROW_BLOCK
+    assert COUNT >> LOG2_OWNED_ROWS
     rows, weights, grad = corners_and_gradient(points, channels, seed)
     expected = scattered(rows, weights, grad.double(), torch.Size([COUNT, channels]), False)
     whole = torch.zeros(COUNT, channels)
@@ -46,7 +46,7 @@ def test_numbers(points, seed):
 @pytest.mark.parametrize("threads", [2, 3, 4])
 def test_any_number_of_threads(threads, channels, monkeypatch):
     """To the bit: whoever owns a row adds up its contributions in the points' order, by the same machine code."""
-    monkeypatch.setattr(lookup, "CACHED", 0)
+    monkeypatch.setattr(lookup, "SERIAL_NUMBERS", 0)
     rows, weights, grad = corners_and_gradient(4000, channels, 0)
     found, before = [], torch.get_num_threads()
     for count in (1, threads):

@@ -8,7 +8,7 @@ from gaussian_scenes import DOUBLE, FLOOR, SETTINGS, Setting, alphas, both_ways,
 from torch import Tensor
 
 from ctm_plugin.cpu.splat_projection import GEOMETRY, project
-from ctm_plugin.cpu.splats import BROAD, TALL, binned, draw, packed
+from ctm_plugin.cpu.splats import TILE_HEIGHT, TILE_WIDTH, binned, draw, packed
 from ctm_plugin.splats.gaussians import Gaussians
 from ctm_plugin.splats.render import INVERSE_CHANNELS, PLANE_CHANNELS, picture
 
@@ -59,7 +59,7 @@ def test_many_opaque_layers():
     close(found, expected, counts, 2e-3)  # what is left out pulls at opacities, by a share of little
     flat, (owner, _, _, tiles), colors = listed(of)
     image, left, ends = torch.empty(3, 40, 40), torch.empty(40, 40), torch.empty(len(tiles) - 1, dtype=torch.int64)
-    draw(tiles, owner, flat, colors, -(-40 // BROAD), image, left, ends)
+    draw(tiles, owner, flat, colors, -(-40 // TILE_WIDTH), image, left, ends)
     assert (ends - tiles[:-1]).sum() < 0.5 * len(owner)  # most of the lists are not gone through
 
 
@@ -70,7 +70,7 @@ def listed(of: Setting) -> tuple[Tensor, tuple[Tensor, ...], Tensor]:
     flat, basis, colors = (torch.empty(count, wide) for wide in (GEOMETRY, of.degrees**2, k))
     numbers = packed(of.camera, FLOOR)
     project(*tables, torch.zeros(count, 2), numbers, of.degrees, flat, basis, colors)
-    return flat, binned(flat, -(-of.camera.width // BROAD), -(-of.camera.height // TALL)), colors
+    return flat, binned(flat, -(-of.camera.width // TILE_WIDTH), -(-of.camera.height // TILE_HEIGHT)), colors
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -81,7 +81,7 @@ def test_needles_are_in_the_lists_of_the_tiles_that_they_reach(seed):
     dx, dy = (at - mean[:, None, None] for at, mean in zip((x, y), found.means.T, strict=True))
     wide, high = found.extents.T[..., None, None]
     here, around = (
-        each.view(80, 96 // TALL, TALL, 160 // BROAD, BROAD).any(4).any(2).flatten(1)
+        each.view(80, 96 // TILE_HEIGHT, TILE_HEIGHT, 160 // TILE_WIDTH, TILE_WIDTH).any(4).any(2).flatten(1)
         for each in (alphas(found, of.camera) > 1.01 / 255, (dx.abs() < wide) & (dy.abs() < high))
     )
     owner, _, _, tiles = listed(of)[1]

@@ -68,7 +68,7 @@ def test_a_logger_and_a_callback_of_another_package(installed, arguments, tmp_pa
     run = tmp_path / "run"
     theirs = ("logger=notes", "logger.file=mine.txt", "callbacks=count", "callbacks.count.by=2", "~callbacks.film")
     assert main([*arguments, *SMALL, *EVERY, *theirs, "callbacks.progress=null", f"hydra.run.dir={run}"]) == 0
-    assert {name for name, node in load_config(run)["callbacks"].items() if node} == {"dashboard", "count"}
+    assert {name for name, node in load_config(run)["callbacks"].items() if node is not None} == {"dashboard", "count"}
     told = notes(run / "mine.txt")
     curves = [content for kind, _, _, content in told if kind == "curves"]
     assert [each["loss/total"] > 0 for each in curves if "loss/total" in each] == [True] * 6

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch.autograd import gradcheck
 
-from ctm_plugin.cpu.lookup import SPARSE
+from ctm_plugin.cpu.lookup import SPARSE_FACTOR
 from ctm_plugin.rays.grid import (
     Corners,
     VoxelGrid,
@@ -125,7 +125,7 @@ def test_sparse_gradient(count, seed):
         lookup(table, at, sparse).backward(grad)
     found = tables[1].grad
     assert torch.equal(found.to_dense(), tables[0].grad)
-    assert found.is_sparse == (SPARSE * 8 * count < 3 * math.prod(shape))
+    assert found.is_sparse == (SPARSE_FACTOR * 8 * count < 3 * math.prod(shape))
     if found.is_sparse:
         assert torch.equal(found._indices()[0], at.rows.unique().long())
 

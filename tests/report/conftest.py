@@ -46,3 +46,14 @@ def made(tmp_path, composed) -> Callable[..., Path]:
         return folder
 
     return make
+
+
+@pytest.fixture
+def table4(made):
+    """Runs of Table 4, two seeds."""
+    for seed in (0, 1):
+        made("ctm=off", f"seed={seed}", psnr=30.0 + seed, views=True)
+        made(f"seed={seed}", psnr=33.0 + seed, views=True)
+        for term in ("img", "rand"):
+            folder = made(f"seed={seed}", f"ctm.weights.{term}=0", psnr=32.0 + seed, views=True)
+    return folder.parent

@@ -1,10 +1,9 @@
-"""``ctm report``: every format, figures, and every mistake as one message."""
+"""``ctm report``: every format, and every mistake as one message."""
 
 import csv
 import io
 from html.parser import HTMLParser
 
-import imageio.v3 as iio
 import pytest
 from mutations import put
 
@@ -15,17 +14,6 @@ BIKES = ("dataset=rawnerf", "dataset.root=x")
 
 def main(arguments: list[str]) -> int:
     return cli.main(["report", *arguments])
-
-
-@pytest.fixture
-def table4(made):
-    """Runs of Table 4, two seeds."""
-    for seed in (0, 1):
-        made("ctm=off", f"seed={seed}", psnr=30.0 + seed, views=True)
-        made(f"seed={seed}", psnr=33.0 + seed, views=True)
-        for term in ("img", "rand"):
-            folder = made(f"seed={seed}", f"ctm.weights.{term}=0", psnr=32.0 + seed, views=True)
-    return folder.parent
 
 
 def test_markdown(table4, capsys):
@@ -129,13 +117,6 @@ def test_html_shows_strings_of_strangers_as_text(made, tmp_path):
     assert "&lt;img src=x" in out.read_text()
 
 
-def test_figures_show_names_as_they_are(made, tmp_path):
-    """Between dollars matplotlib would read formulas."""
-    for arguments in (["ctm=off"], ["ctm=on"]):
-        folder = made(*arguments, views=True, dataset=r"$\bad{ a_b$")
-    assert main([str(folder.parent), "figure=4", f"out={tmp_path / 'figure'}"]) == 0
-
-
 def titles(text: str) -> list[str]:
     return [line[4:].split(":")[0] for line in text.splitlines() if line.startswith("###")]
 
@@ -168,22 +149,6 @@ def test_all_runs_come_first_and_the_papers_beside_its_data(made, capsys):
     assert "In no row of this table: 1 of the runs." in papers
 
 
-@pytest.mark.parametrize("name", ["3", "4", "5", "7", "8"])
-def test_figures(table4, made, tmp_path, name):
-    made("ctm=off", "color_space=lab", views=True)
-    made("ctm.k=1", views=True)
-    out = tmp_path / "figures" / "one"
-    assert main([str(table4), f"figure={name}", f"out={out}"]) == 0
-    assert iio.imread(f"{out}.png").std() > 1
-    assert out.with_suffix(".pdf").read_bytes().startswith(b"%PDF")
-
-
-@pytest.mark.parametrize("name", ["3", "4", "5", "6", "7", "8", "C"])
-def test_figures_say_what_is_missing(made, capsys, name):
-    assert main([str(made("ctm=off")), f"figure={name}"]) == 1
-    assert f"figure={name}: found nothing to show, expected" in capsys.readouterr().err
-
-
 def test_unfinished_runs_are_named(made, capsys):
     made("ctm=off")
     folder = made("ctm=on")
@@ -208,26 +173,6 @@ def test_mistakes(made, refused, arguments, message):
     assert message in refused("report", *(folder if argument == "RUN" else argument for argument in arguments))
 
 
-@pytest.mark.parametrize(
-    ("name", "told"),
-    [
-        ("3", "found nothing to show, expected a run without the term img and one with all"),
-        ("4", "found no picture of the "),
-        ("7", "found nothing to show, expected a run without the term rand and one with all"),
-    ],
-)
-def test_pictures_that_are_missing_are_told(table4, capsys, name, told):
-    """Those of all runs but the first, which is without CTM."""
-    assert main([str(table4), f"figure={name}", f"out={table4 / 'x'}"]) == 0
-    for path in table4.glob("*/*/r_1.png"):
-        if path.parts[-3] != "001":
-            path.unlink()
-    capsys.readouterr()
-    assert main([str(table4), f"figure={name}", f"out={table4 / 'y'}"]) == 1
-    assert told in capsys.readouterr().err
-
-
-@pytest.mark.parametrize("more", [[], ["figure=4"]])
-def test_an_output_that_is_no_file(table4, capsys, more):
-    assert main([str(table4), "out=.", *more]) == 1
+def test_an_output_that_is_no_file(table4, capsys):
+    assert main([str(table4), "out=."]) == 1
     assert "out: found '.', expected the name of a file" in capsys.readouterr().err

@@ -1,6 +1,8 @@
 """What is left to the program: decided by what the capture is, said, and never against what was given."""
 
+import shutil
 from collections import Counter
+from pathlib import Path
 
 import pytest
 import torch
@@ -74,7 +76,7 @@ def test_splats_stay_on_the_processor_where_a_gpu_has_nothing_to_composite_them_
 @pytest.mark.parametrize(("scene", "records"), [("ball", 2), ("hall", 0)])
 def test_what_it_read_is_not_read_again(request, small, untrained, monkeypatch, scene, records):
     """From a folder to the first step: a file with cameras, and a picture's header and its pixels, once each."""
-    root, times = request.getfixturevalue(scene), Counter()
+    root, times = Path(shutil.copytree(request.getfixturevalue(scene), "fresh")), Counter()
 
     def counted(module, name):
         own = getattr(module, name)

@@ -151,7 +151,7 @@ def test_a_file_and_a_line_add_a_transform_and_a_data_set(added, tmp_path):
     data = ("dataset=album", f"dataset.root={tmp_path}", "dataset.geometry=bounded", "trainer=smoke")
     config = compose("ctm=halved", "ctm.times=2", *data)
     assert (config["ctm"]["preset"], config["ctm"]["times"], config["dataset"]["pages"]) == ("halved", 2, 3)
-    transform, _ = color_transform(config, 0)
+    transform = color_transform(config, 0)
     assert (type(transform).__name__, transform.config.times) == ("Halved", 2)
     assert load_scene(config).pages == 3
     assert choices(conf_dir(), "ctm")["halved"] == "Half of each colour"

@@ -41,7 +41,7 @@ HD = 720
 
 
 class ClipHeader(NamedTuple):
-    """What a clip says of itself.
+    """Metadata of a clip by ffmpeg.
 
     Attributes:
         count: about how many frames it has; 0: it does not tell.

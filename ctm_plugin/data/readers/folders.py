@@ -88,7 +88,7 @@ def require_file(path: Path, expected: str) -> None:
 
 
 def read_bytes(path: Path, expected: str) -> bytes:
-    """A file's content."""
+    """Read a file's content."""
     require_file(path, expected)
     with told(path, "a file that cannot be read", expected):
         return path.read_bytes()

@@ -1,4 +1,4 @@
-"""What a ``transforms.json`` says of its cameras: read, refused, or known to change nothing; no key goes unheard."""
+"""Cameras in a ``transforms.json``: every key is read, refused, or known to change nothing."""
 
 from __future__ import annotations
 

@@ -70,7 +70,7 @@ def opened(path: Path) -> Iterator[Image.Image]:
 
 
 def heif_formats() -> tuple[str, ...]:
-    """What Pillow calls the pictures that pillow-heif opens for it: HEIC and others, turned as they are to be shown."""
+    """Pillow's names of the formats that pillow-heif opens for it: HEIC and others, upright."""
     try:
         from pillow_heif import register_heif_opener
     except ImportError as error:
@@ -149,7 +149,7 @@ class PictureFile:
     decode: Decoder = open_picture
 
     def as_stored(self) -> PictureFile:
-        """The same without EXIF's turn."""
+        """The same file, read without EXIF's rotation."""
         return replace(self, header=self.header.as_stored())
 
     def image(self) -> Float32[Tensor, "h w c"]:

@@ -1,4 +1,4 @@
-"""Which layouts a folder's files are of: each loader opens its folder here. An error names the one that fits."""
+"""Layouts of a folder's files: each loader opens its folder here. An error names the one that fits."""
 
 from __future__ import annotations
 

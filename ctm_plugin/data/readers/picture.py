@@ -1,4 +1,4 @@
-"""What all decoders of pictures share: what a picture says of itself, how large it may be, which way up it is."""
+"""Parts that all decoders of pictures share: the header, the largest size, the orientation."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ UPRIGHT_ORIENTATION = 1
 
 
 class Lens(NamedTuple):
-    """What took a picture, as its EXIF says it; ``None`` where it does not.
+    """Camera, lens and focal length by EXIF; ``None`` where it has none.
 
     Attributes:
         maker, model: of the camera.
@@ -41,7 +41,7 @@ class Lens(NamedTuple):
 
 
 class Header(NamedTuple):
-    """What a picture says of itself before it is decoded.
+    """Metadata of a picture before it is decoded.
 
     Attributes:
         height, width: in pixels, of the picture as it is shown.

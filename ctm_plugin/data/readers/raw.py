@@ -73,7 +73,7 @@ def require_rawpy() -> ModuleType:
 
 
 class RawHeader(NamedTuple):
-    """What a raw picture says of itself.
+    """Metadata of a raw picture.
 
     Attributes:
         side: the longer one in pixels.

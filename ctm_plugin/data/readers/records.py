@@ -44,7 +44,7 @@ class Record:
         return DataError(self.source, f"{self.place(key)} = {reprlib.repr(self.values[key])}", expected)
 
     def checked(self, key: str, allowed: Callable[[Any], bool], expected: str) -> Any:
-        """What stands under ``key``, for which ``allowed`` has to hold; ``None`` where nothing does."""
+        """Value under ``key``, for which ``allowed`` has to hold; ``None`` where there is none."""
         value = self.values.get(key)
         if not allowed(value):
             raise self.fault(key, expected)
@@ -111,7 +111,7 @@ def _parsed(path: Path, _changed: int, _size: int) -> Record:
 
 
 def rendered(root: Path, key: str) -> float:
-    """What our own renderer wrote into a data set's ``settings.json``; 1 for data sets from elsewhere.
+    """Exposure that our own renderer wrote into a data set's ``settings.json``; 1 for data sets from elsewhere.
 
     ``light`` is the one that it was made with, relative to normal; ``depth_scale`` is scene units in one step of its
     depth pictures.

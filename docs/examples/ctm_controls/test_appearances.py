@@ -9,8 +9,8 @@ from ctm_controls.bilateral import Bilateral
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ctm_plugin.appearance.exposure import Exposure, Place
-from ctm_plugin.appearance.photographed import shown
+from ctm_plugin.appearance.exposure import Exposure, PixelPlaces
+from ctm_plugin.appearance.photographed import exposed
 from ctm_plugin.color.srgb import linear_to_srgb, srgb_to_linear
 from ctm_plugin.errors import ConfigError
 from ctm_plugin.scene.views import Views
@@ -39,10 +39,10 @@ def colors(rows: int = 300) -> torch.Tensor:
     return torch.rand(rows, 3, generator=torch.Generator().manual_seed(1))
 
 
-def place(rendered: torch.Tensor) -> Place:
+def place(rendered: torch.Tensor) -> PixelPlaces:
     """Random pixels of the five pictures, with what is rendered there."""
     draw, rows = torch.Generator().manual_seed(0), len(rendered)
-    return Place(torch.randint(0, COUNT, (rows,), generator=draw), torch.rand(rows, 2, generator=draw), rendered)
+    return PixelPlaces(torch.randint(0, COUNT, (rows,), generator=draw), torch.rand(rows, 2, generator=draw), rendered)
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -109,7 +109,7 @@ def error(kind: type, photographs: torch.Tensor, **settings) -> float:
     adams = [torch.optim.Adam([raw], 0.15), found.optimizer(120)[0]]
     for _ in range(120):
         rgb = raw.sigmoid().repeat(count, 1)
-        apart = shown(found, rgb, Place(view, at, rgb.detach())) - photographs.flatten(0, 1)
+        apart = exposed(found, rgb, PixelPlaces(view, at, rgb.detach())) - photographs.flatten(0, 1)
         for adam in adams:
             adam.zero_grad()
         (100 * apart.square().mean() + sum(found.regularisers().values())).backward()

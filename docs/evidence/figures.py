@@ -1,7 +1,12 @@
-"""The paper's figures out of finished runs, as PNG and PDF."""
+"""The paper's figures out of finished runs, as PNG and PDF.
+
+``python docs/evidence/figures.py FIGURE RUNS... [out=NAME]`` draws figure 3 to 8, or C of appendix C, as NAME.png and
+NAME.pdf, by default ``figure_FIGURE``.
+"""
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -14,6 +19,7 @@ from matplotlib.patches import Rectangle
 
 from ctm_plugin.errors import CheckpointError, CTMError
 from ctm_plugin.files import replacing
+from ctm_plugin.report.labels import find_runs
 from ctm_plugin.report.pairs import pairs, picture, pictures, where_they_differ
 from ctm_plugin.report.runs import Run, weights
 from ctm_plugin.report.tables import fits
@@ -43,6 +49,8 @@ def draw(name: str, runs: Sequence[Run], path: Path) -> list[Path]:
     Raises:
         CTMError: the runs do not hold what the figure shows; it is said what is missing.
     """
+    if name not in (known := [*FIGURES, "4", "C"]):
+        raise CTMError(f"figure: found {name}, expected one of {', '.join(sorted(known))}")
     figure = {"4": renders, "C": variances}.get(name, partial(compared, name))(runs)
     written = [path.with_name(path.name + ending) for ending in (".png", ".pdf")]
     for file in written:
@@ -217,3 +225,21 @@ def _grid(rows: Sequence[Sequence[Picture]], columns: Sequence[str], titles: Seq
 
 def _missing(figure: str, what: str) -> CTMError:
     return CTMError(f"figure={figure}: found nothing to show, expected {what}")
+
+
+def main(arguments: Sequence[str]) -> None:
+    """Draw a figure of the runs in some folders."""
+    name, *folders = [each for each in arguments if not each.startswith("out=")]
+    out = next((each.removeprefix("out=") for each in arguments if each.startswith("out=")), f"figure_{name}")
+    found = find_runs([Path(each) for each in folders])
+    for why in found.left_out:
+        print(f"left out: {why}", file=sys.stderr)
+    for path in draw(name, found.runs, Path(out)):
+        print(f"written to {path}")
+
+
+if __name__ == "__main__":
+    try:
+        main(sys.argv[1:])
+    except CTMError as error:
+        sys.exit(f"error: {error}")
