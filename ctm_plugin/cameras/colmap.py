@@ -9,14 +9,15 @@ import math
 import tempfile
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from itertools import combinations
 from pathlib import Path
 from types import ModuleType
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from jaxtyping import Float32
+from torch import Tensor
 
 from ctm_plugin.cameras.settings import MIN_PICTURES
 from ctm_plugin.data.readers.picture import Header
@@ -26,8 +27,6 @@ Reconstruction = Any
 """``pycolmap.Reconstruction``; ``pycolmap`` is imported only when it is used."""
 DATABASE = "database.db"
 """Name of COLMAP's database in the working folder."""
-NEIGHBOURS = 10
-"""Pictures of a long capture on each side, by name, that each is matched with; then those 16, 32, 64, ... away."""
 STANDARD = (100, 30, 16.0)
 """COLMAP's own start: least matches of the first two pictures, of each other one, least degrees between the first
 two."""
@@ -85,6 +84,16 @@ class Workshop:
         database.close()
         return count
 
+    def looks(self, count: int) -> list[Float32[Tensor, "n 128"]]:
+        """What the ``count`` largest SIFT details of each picture look like, of length 1."""
+        database = require_pycolmap().Database.open(self.database)
+        found = []
+        for number in range(1, database.num_images() + 1):
+            largest = np.argsort(-database.read_keypoints(number)[:, 2])[:count]
+            found.append(F.normalize(torch.from_numpy(database.read_descriptors(number).data[largest]).float(), dim=-1))
+        database.close()
+        return found
+
     def store(self, headers: Sequence[Header], lens: str, features: Iterable[Features]) -> None:
         """Write pictures, numbered from 1 and named by their numbers: a camera for each lens and size.
 
@@ -113,7 +122,7 @@ class Workshop:
                 frame.add_data_id(image.data_id)
                 database.write_frame(frame, use_frame_id=True)
                 database.write_keypoints(number, feature.places)
-                if not isinstance(feature.descriptors, torch.Tensor):
+                if not isinstance(feature.descriptors, Tensor):
                     database.write_descriptors(number, feature.descriptors)
         database.close()
 
@@ -241,15 +250,3 @@ def extract(picture: Float32[np.ndarray, "h w"], scale: int, pooled: bool) -> Fe
     keypoints, descriptors = extractor.extract_from_float32_array(np.ascontiguousarray(picture))
     places = colmap.keypoints_to_matrix(keypoints)[:, :4] * np.array([scale, scale, scale, 1], dtype=np.float32)
     return Features(places, descriptors)
-
-
-def choose_pairs(count: int, max_pairs: int) -> list[tuple[int, int]]:
-    """Pairs of ``count`` pictures to match: all up to ``max_pairs``, else neighbours in a ring; numbers from 1.
-
-    The ring closes captures that go round; steps that double tie passes to one another that lie far apart by name.
-    """
-    if count <= max_pairs:
-        return list(combinations(range(1, count + 1), 2))
-    steps = [*range(1, NEIGHBOURS + 1), *(2**power for power in range(4, count.bit_length()) if 2**power < count)]
-    ring = {tuple(sorted((first, (first + step) % count))) for step in steps for first in range(count)}
-    return [(first + 1, second + 1) for first, second in sorted(ring)]

@@ -15,9 +15,10 @@ import torch.nn.functional as F
 from jaxtyping import Float32, Int64
 from torch import Tensor
 
-from ctm_plugin.cameras.colmap import CLOSER, FEWER_MATCHES, STANDARD, Features, Workshop, choose_pairs, extract, sights
+from ctm_plugin.cameras.colmap import CLOSER, FEWER_MATCHES, STANDARD, Features, Workshop, extract, sights
 from ctm_plugin.cameras.learned import PACKAGE, find_details, has_network, nearest_to_each_other
 from ctm_plugin.cameras.lenses import tell_lenses_apart
+from ctm_plugin.cameras.pairs import VOTERS, all_pairs, likely_pairs
 from ctm_plugin.cameras.refine import Light, blurred, refine
 from ctm_plugin.cameras.settings import MIN_PICTURES, CamerasConfig
 from ctm_plugin.cameras.trust import Trusted, trusted
@@ -83,7 +84,7 @@ def find_cameras(
         DataError: too few pictures find a place, or too little holds them.
     """
     paths, headers, gain, best = [each.path for each in pictures], [each.header for each in pictures], 1.0, Trusted()
-    pairs = choose_pairs(len(paths), settings.all_pairs)
+    pairs = all_pairs(len(paths)) if len(paths) <= settings.all_pairs else []
     with ThreadPoolExecutor(None if settings.threads < 0 else settings.threads) as pool:
         lights = list(with_progress("brightness", pool.map(partial(read_light, size=settings.size), pictures), paths))
         if settings.brighten:
@@ -102,6 +103,7 @@ def find_cameras(
                 nearest = partial(nearest_of, [each.descriptors for each in looks])
                 features = looks[work.stored() :]
             work.store(headers, settings.lens, features)
+            pairs = pairs or likely_pairs(work.looks(VOTERS))  # the first details are SIFT's
             with stage("pairs", len(pairs)) as done:
                 matched = work.match(pairs, done, nearest)
             for start in (rung.start, CLOSER)[: 2 if matched else 0]:

@@ -32,8 +32,8 @@ class CamerasConfig(Settings):
         least=64,
     )
     all_pairs: int = setting(
-        150,
-        "up to this many pictures, each is compared with all others; more are compared with their neighbours by name",
+        60,
+        "up to this many pictures, each is compared with all others; more with those that look alike and neighbours",
         least=MIN_PICTURES,
     )
     lens: str = setting(

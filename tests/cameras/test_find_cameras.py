@@ -7,7 +7,6 @@ import shutil
 import subprocess
 import sys
 from importlib.util import find_spec
-from itertools import combinations
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -24,7 +23,7 @@ from scipy.spatial.transform import Rotation
 
 from ctm_plugin import cli
 from ctm_plugin.cameras import command
-from ctm_plugin.cameras.colmap import FILM_DIAGONAL, choose_pairs, focal_length
+from ctm_plugin.cameras.colmap import FILM_DIAGONAL, focal_length
 from ctm_plugin.cameras.exposures import UNEVEN
 from ctm_plugin.cameras.photographs import home_of, list_photographs
 from ctm_plugin.cameras.trust import Trusted
@@ -375,16 +374,6 @@ def test_what_was_done_before_an_interrupt_is_for_the_same_search(three, monkeyp
     assert cli.main(["cameras", str(three), "size=100"]) == 1
     assert begun == [False, True, False, False]
     assert [path.name for path in three.iterdir()] == ["images"]
-
-
-@pytest.mark.parametrize("count", [3, 20, 40, 333])
-def test_pairs(count):
-    assert choose_pairs(count, count) == list(combinations(range(1, count + 1), 2))
-    ring = choose_pairs(count, 3)
-    assert ring == sorted(set(ring))
-    assert all(1 <= first < second <= count for first, second in ring)
-    assert {(number, number + 1) for number in range(1, count)} | {(1, count)} <= set(ring)
-    assert len(ring) <= count * (10 + np.log2(count))
 
 
 @pytest.mark.parametrize(("said", "focal"), [(None, 1.2 * 40), (26, 26 * 50 / 43.27)])

@@ -1,4 +1,4 @@
-"""Lenses by the focal lengths that pictures would like to have; with COLMAP in test_find_cameras.py."""
+"""Lenses by the focal lengths that fit pictures best; with COLMAP in test_find_cameras.py."""
 
 import numpy as np
 import pytest
