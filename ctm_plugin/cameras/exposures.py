@@ -18,7 +18,7 @@ from ctm_plugin.data.readers.colmap_model import is_as_shown
 from ctm_plugin.data.readers.images import read_picture
 
 UNEVEN = 0.05
-"""Of the light: photographs whose gains spread by more are uneven. Measured: 0.045 to 0.055 in LOM's captures."""
+"""Spread of gains above which photographs are uneven. Measured: 0.045 to 0.055 in LOM's captures."""
 SIZE = 300
 """Longest side of the copies in which light is looked up: a pixel there is the mean of many."""
 DARKEST, BRIGHTEST = 1e-5, 0.8
