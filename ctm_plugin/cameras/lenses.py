@@ -1,4 +1,4 @@
-"""Pictures without a focal length in EXIF are grouped by the one that fits each best: a camera for each lens."""
+"""Lenses of pictures whose EXIF tells none, separated by the focal length that fits each picture best."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from ctm_plugin.cameras.colmap import Reconstruction, adjust, require_pycolmap
 MIN_RATIO = 1.15
 """Ratio of two lenses' focal lengths, at least. Measured: one lens's are within 1.04, in noise 1.25 without a gap."""
 MAX_SPREAD = 0.25
-"""Largest spread of one lens's focal lengths, a share of the distance to the next lens, in logarithms."""
+"""Largest spread of one lens's focal lengths, as a share of the distance between two lenses, in logarithms."""
 MIN_PICTURES_OF_A_LENS = 3
 
 

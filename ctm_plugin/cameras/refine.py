@@ -16,7 +16,7 @@ from ctm_plugin.cameras.colmap import MIN_TRACK, Reconstruction, adjust, require
 from ctm_plugin.show.bars import Update
 
 BLUR = 0.15
-"""Standard deviation of the Gaussian that pictures are blurred with, a share of a patch's reach."""
+"""Standard deviation of the Gaussian that blurs pictures, as a share of a patch's reach."""
 STEPS = 2
 """Moves of each patch before cameras are adjusted."""
 MAX_STEP, MAX_MOVE = 1.5, 4.0
