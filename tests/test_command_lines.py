@@ -256,11 +256,13 @@ def pip(words: Sequence[str]) -> None:
     assert words[0] == "install"
     for flag, word in itertools.pairwise(words):
         if word.startswith("-"):
-            assert word in ("-c", "-e")
+            assert word in ("-c", "-e", "--no-deps")
         elif flag == "-c" or "/" in word:
             assert (ROOT / word).exists()
         elif "==" in word:
             assert word in pinned
+        elif flag == "--no-deps":  # of packages that want others than they need
+            assert any(line.startswith(f"{word}==") for line in pinned)
         elif word not in ("build", "twine"):
             wanted = Requirement(word.replace(".", project["name"], 1))
             assert wanted.name.replace("_", "-") == project["name"]
