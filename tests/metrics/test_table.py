@@ -116,7 +116,7 @@ def test_dashboard(result, tmp_path):
     assert layout()["Quality"]["contrast of a test view"] == ["Multiline", ["contrast/test_view$"]]
     picture = torch.rand(4, 5, 3)
     shown = compared(picture, picture / 2, picture, None, Light())
-    assert shown.scores["contrast/test_view"] == pytest.approx(255 * float(picture.std()))
+    assert shown.scores["contrast"] == pytest.approx(255 * float(picture.std()))
     TensorBoard(TensorBoard.Config(), tmp_path, 0).log_scores({"ctm": "off"}, result)
     events = EventMultiplexer({"run": str(tmp_path / "tensorboard" / "final")}).Reload()
     assert events.Scalars("run", "final/contrast")[0].value == pytest.approx(result["contrast"])

@@ -104,7 +104,7 @@ def test_of_another_backbone(forward_page):
 def test_of_places_without_photographs(own, monkeypatch):
     posed = load_posed(own)
     monkeypatch.setattr(pages, "find_spec", lambda name: None)
-    monkeypatch.setattr(posed.module, "targets", lambda: [None] * len(posed.module.scene.test))
+    monkeypatch.setattr(posed.module, "target", lambda view: None)
     write_page(own / "index.html", own, posed, posed.light)
     assert "from places where nobody has taken a photograph" in text_of(own)
     assert 'class="stage compare"' not in text_of(own)
