@@ -50,7 +50,7 @@ LEFT_OUT = {
     "tests/backbones/test_nerf.py::test_the_command": "a command line",
     "tests/backbones/test_barf2d.py::test_the_command_line": "a command line",
 }
-"""Slow tests, and what they are, for ``make test`` alone."""
+"""Slow tests, and what they are: run as they are alone."""
 TRAINING = [f"tests/{name}" for name in (
     "callbacks", "runs/test_processes.py", "runs/test_resume.py", "runs/test_train.py",
     "test_other_device.py",

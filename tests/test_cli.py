@@ -43,6 +43,7 @@ def test_the_command_to_the_letter_and_without_plus(small, capsys):
     assert f"written to {first.resolve()}" in printed.replace("\n", "")
 
 
+@pytest.mark.slow
 def test_jobs_of_a_sweep_are_the_single_runs(small):
     """Nothing of one job leaks into the next."""
     assert main(["-m", *small, "+ctm=off,on", "hydra.sweep.dir=all"]) == 0

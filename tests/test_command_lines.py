@@ -222,6 +222,7 @@ def test_every_verb_has_a_line():
     assert VERBS.keys() <= {line.partition(" ")[0] for line in LINES}
 
 
+@pytest.mark.slow
 def test_demo(tmp_path, monkeypatch):
     """As it is, with fewer steps."""
     monkeypatch.chdir(tmp_path)

@@ -67,6 +67,7 @@ def test_budgets_are_of_backbones_and_trainers_that_exist():
 LINES = [[], ["experiment=table3", "seed=4"], ["backbone=nerf", "trainer=paper", "dataset=llff", "dataset.root=x"]]
 
 
+@pytest.mark.slow
 def test_what_tests_compose_is_what_hydra_does(composed, tmp_path):
     """``composing.py`` leaves other processes alone."""
     script = (

@@ -71,6 +71,7 @@ def test_what_cannot_be_used_is_refused():
         ctm.load_run("nowhere")
 
 
+@pytest.mark.slow
 def test_a_run_is_looked_at_from_any_camera(splat_run):
     run = ctm.load_run(splat_run)
     views, world = run.module.scene.test, run.module.scene.world or IDENTITY
@@ -87,6 +88,7 @@ def test_a_run_is_looked_at_from_any_camera(splat_run):
         other.gaussians()
 
 
+@pytest.mark.slow
 def test_the_page_s_lines_train_splats_in_the_loop_of_gsplat_s_own_trainer():
     """A rasteriser of flat Gaussians, an Adam for each of their tables, a scheduler: ``examples/simple_trainer.py``."""
     page = Path(__file__).parents[1].joinpath("docs/plug_in.md").read_text(encoding="utf-8")

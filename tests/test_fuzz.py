@@ -24,6 +24,7 @@ def fuzzer(tmp_path_factory):
     return Fuzzer(tmp_path_factory.mktemp("fuzz"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_what_is_broken_works_or_is_told(fuzzer, kind):
     ended = [fuzzer.case(kind, 7, number) for number in range(CASES.get(kind, USUALLY))]

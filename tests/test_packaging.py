@@ -41,6 +41,7 @@ def test_wheel_holds_configs_and_scenes(wheel):
     assert {"ctm_plugin/report/tables.yaml", "ctm_plugin/report/page.html.jinja"} <= names
 
 
+@pytest.mark.slow
 def test_wheel_composes_away_from_the_checkout(wheel, tmp_path):
     site = tmp_path / "site"
     zipfile.ZipFile(wheel).extractall(site)

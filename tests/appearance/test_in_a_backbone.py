@@ -24,6 +24,7 @@ def stepped(parts):
     return out
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("backbone", ["dvgo", "nerf", "ngp", "splat"])
 def test_the_identity_changes_no_term(compose, backbone):
     """NeRF's coarse rendering too, DVGO's per-point error and the background."""

@@ -51,6 +51,7 @@ def overrides(painting) -> tuple[str, ...]:
 # The task
 
 
+@pytest.mark.slow
 def test_translations_are_found(painting):
     loaded = PlanarConfig(image=painting, noise_h=0, noise_t=0.2, **(SIZE | {"patch": 16})).load()
     torch.testing.assert_close(loaded.true_warps[:, :2], 0.2 * PATCH_DIRECTIONS)

@@ -90,6 +90,7 @@ def test_geometry_of_another_scene(make, name):
         make(name, "unbounded", dataclasses.replace(make.scenes["unbounded"], near=0.0))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "geometry"), [each for each in EVERY if each[1] != "bounded" and each[0] != "dvgo"])
 def test_other_geometries_train(compose, tmp_path, monkeypatch, wall, name, geometry):
     scene = dataclasses.replace(wall, geometry=geometry)

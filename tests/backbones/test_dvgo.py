@@ -186,6 +186,7 @@ SIZES = (
 )  # fmt: skip
 
 
+@pytest.mark.slow
 def test_learns_colours_and_depth(llff, tmp_path):
     """With CTM, under which less of it is certain."""
     train(llff(*SIZES, "ctm=quick", "ctm.pretrain_steps=200"), tmp_path / "run")

@@ -233,6 +233,7 @@ def test_the_command(ball, tmp_path, monkeypatch, ctm):
     assert math.isfinite(found["psnr"])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("precision", ["32-true", "bf16-mixed"])
 def test_training_learns(compose, tmp_path, precision):
     sizes = ("steps=150", "rays=128", "width=32", "lr=0.005", "coarse_samples=16", "fine_samples=16")

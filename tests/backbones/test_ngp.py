@@ -202,6 +202,7 @@ def test_other_free_space_never_settles(scene, why):
 # Runs
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ctm", ["off", "quick"])
 def test_training_learns(compose, tmp_path, ctm):
     sizes = ("steps=150", "rays=128", "samples=64", "lr_grid=0.1")

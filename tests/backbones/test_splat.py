@@ -87,6 +87,7 @@ def test_squared_differences_leave_dissimilarity_out(compose, scene):
     assert (other.photometric.kind, other.dssim) == ("mse", 0)
 
 
+@pytest.mark.slow
 def test_opacity_size_and_bends_cost_what_they_weigh(scene):
     module = make(scene, opacity=0.3, size=0.7, bend=0.2, views=2)
     draws = module.draws(0)

@@ -38,6 +38,7 @@ def config(compose, *more: str):
     return compose(*SPLAT, f"trainer.minutes={MINUTES}", *more)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "seconds_a_step",
     [

@@ -124,6 +124,7 @@ def test_what_is_told(dark, found):
     assert "1 other files are left out, as 'notes.txt'" in found.stderr
 
 
+@pytest.mark.slow
 @COLMAP
 @pytest.mark.usefixtures("found")
 def test_stopped_the_same_command_goes_on_to_the_same_cameras(dark, tmp_path):
@@ -160,6 +161,7 @@ def spread_of(root: Path) -> float:
     return float(subprocess.run([sys.executable, "-c", code, root], capture_output=True, text=True, check=True).stdout)
 
 
+@pytest.mark.slow
 @COLMAP
 @pytest.mark.usefixtures("found")
 def test_uneven_exposures_are_seen_in_the_points(dark, tmp_path):
@@ -200,6 +202,7 @@ def test_two_lenses_and_upright_pictures_have_a_camera_each(tmp_path):
     assert {name: float(each) for name, each in found.items()} == pytest.approx({n: focal[n] for n in found}, rel=0.02)
 
 
+@pytest.mark.slow
 @COLMAP
 def test_two_lenses_that_nothing_tells_have_a_camera_each(tmp_path):
     """Pictures of one size without EXIF, every second one zoomed in."""

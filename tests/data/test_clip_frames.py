@@ -48,6 +48,7 @@ def test_frames_are_apart_by_movement_and_not_by_the_clock():
     assert sum(120 < number < 179 for number in numbers) <= 2
 
 
+@pytest.mark.slow
 def test_the_sharpest_is_chosen():
     """Of five frames in a row one is not blurred by the camera's motion."""
     places = np.arange(0, 400)

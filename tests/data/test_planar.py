@@ -69,6 +69,7 @@ def test_all_corners_lie_inside(seed):
     assert torch.equal(warps, draw_warps(config))
 
 
+@pytest.mark.slow
 def test_four_patches_go_to_the_corners():
     warps = torch.stack([draw_warps(PlanarConfig(seed=seed)) for seed in range(80)])
     torch.testing.assert_close(warps.mean(0)[:, :2], 0.2 * PATCH_DIRECTIONS, atol=0.05, rtol=0)

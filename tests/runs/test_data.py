@@ -76,6 +76,7 @@ def test_data_moved_away(here, expected, capsys, command):
     assert psnr(here / "run") == expected
 
 
+@pytest.mark.slow
 def test_other_data_are_told_and_not_gone_on_with(here, refused):
     path = here / "ball" / "transforms_test.json"
     path.write_text(json.dumps(json.loads(path.read_text()) | {"camera_angle_x": 0.3}))

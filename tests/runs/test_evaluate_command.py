@@ -32,6 +32,7 @@ VARIANTS = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("variant", VARIANTS, ids=" ".join)
 def test_the_same_numbers_and_pictures(compose, tmp_path, variant, capsys):
     run = tmp_path / "run"

@@ -119,6 +119,7 @@ def run(tmp_path_factory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_lit_splats_from_the_command_line(run, capsys, refused, tmp_path, monkeypatch):
     monkeypatch.setattr("ctm_plugin.runs.export.TRAIN_STEPS", 100)
     assert main(["export", str(run)]) == 0

@@ -46,6 +46,7 @@ def test_from_a_folder_to_lit_views_and_a_film(capture, capsys):
     assert (Path("runs") / "große Halle_2" / "lit").is_dir()
 
 
+@pytest.mark.slow
 def test_stopped_the_same_command_goes_on(capture, capsys, ctrl_c):
     ctrl_c(lambda step: step == 2)
     assert main(["photos", str(capture), *SMALL]) == 130
@@ -57,6 +58,7 @@ def test_stopped_the_same_command_goes_on(capture, capsys, ctrl_c):
     assert [path.name for path in Path("runs").iterdir()] == ["große Halle"]
 
 
+@pytest.mark.slow
 def test_stopped_before_the_film_the_same_command_makes_it(capture, capsys, monkeypatch):
     def stopped(*_: object) -> None:
         raise KeyboardInterrupt

@@ -94,6 +94,7 @@ def test_interrupted_in_a_second_batch(whole, config, tmp_path, ctrl_c, batch):
     same(run, whole)
 
 
+@pytest.mark.slow
 def test_interrupted_in_every_step(whole, config, tmp_path, ctrl_c):
     ctrl_c(lambda seen: seen % 2 == 0)
     run = tmp_path / "run"

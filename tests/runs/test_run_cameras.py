@@ -41,6 +41,7 @@ def made(run: Path, out: str) -> dict[str, bytes]:
     return {str(path.relative_to(run / out)): path.read_bytes() for path in files}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_same_files_with_and_without_photographs(ball, tmp_path, monkeypatch, capsys, kind):
     monkeypatch.setattr("ctm_plugin.runs.splats.TRAIN_STEPS", 3)

@@ -77,6 +77,7 @@ KEYS = {
 SEEDS = {"table3": "range(10)", "table7": "0,1,2,3"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("table", ROWS)
 def test_rows_of_a_table(recorded, table):
     chosen = ["ctm=on"] if table == "table2" else ["seed=9"] if table in SEEDS or table == "table4" else []
@@ -280,6 +281,7 @@ def test_a_search_of_ctms_weights(recorded, monkeypatch):
     assert best["best_params"]["ctm.weights.img"] == weights[-1]["img"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "arguments", [["seed=0,1"], ["seed=0,1", "backbone.lr_grid=1e30"]], ids=["finished", "diverged"]
 )

@@ -131,6 +131,7 @@ def test_a_seed_decides_all(config, run, tmp_path):
     assert scores(tmp_path / "other")["psnr"] != scores(run)["psnr"]
 
 
+@pytest.mark.slow
 def test_training_learns(compose, tmp_path):
     long = ("backbone.steps_alone=60", "ctm.pretrain_steps=300", "ctm.lr=0.005", "dataset.background=random_matched")
     result = train(compose(*SMALL, *long, "backbone.rays=256"), tmp_path)

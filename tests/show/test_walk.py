@@ -39,6 +39,7 @@ def test_spots_are_in_the_page_and_the_server_has_ended(capsys):
     np.testing.assert_allclose(covariances, [[62500, 0, 0, 62500, 0, 62500]] * 7, rtol=1e-2)  # not infinite
 
 
+@pytest.mark.slow
 def test_what_is_near_hides_what_is_far_in_a_page_that_is_opened_as_a_file(tmp_path):
     """Red is nearer but comes first in the file: viser's page alone sorts nothing there."""
     (tmp_path / "a.html").write_text(walk(sheets(1.0, -1.0), START), encoding="utf-8")

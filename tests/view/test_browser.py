@@ -55,6 +55,7 @@ def canvas(page) -> np.ndarray:
     return seen(page, CANVAS)
 
 
+@pytest.mark.slow
 def test_a_picture_comes_and_follows_camera_and_controls(page):
     def changed(since: np.ndarray) -> bool:
         return np.abs(canvas(page) - since).mean() > 2
@@ -91,6 +92,7 @@ def test_a_picture_comes_and_follows_camera_and_controls(page):
     assert page.told == []  # scripts of other hosts were not loaded
 
 
+@pytest.mark.slow
 def test_files_come_down(page, tmp_path):
     def downloaded(button: str):
         with page.expect_download(timeout=20_000) as download:
