@@ -26,7 +26,7 @@ from ctm_plugin.settings.build import Config
 
 APART = 1e-3
 """Of their norm, gradients and sums of a step may differ by this between one process and several."""
-COUNTED = ("push", "seen")
+COUNTED = ("grad2d", "grad2d_count")
 """What is summed over processes besides gradients."""
 
 
@@ -76,7 +76,7 @@ def apart(config: Config, steps: list[dict[str, Any]]) -> float:
     module = parts.backbone
     restore(parts, steps[0], Path())
     alone = {"global_rank": 0, "world_size": 1, "accumulate_grad_batches": batches}
-    module._trainer = SimpleNamespace(global_step=steps[0]["step"], **alone)
+    module._trainer = SimpleNamespace(global_step=steps[0]["step"], state=SimpleNamespace(fn="fit"), **alone)
     if hasattr(module, "renew_pool"):
         module.renew_pool()
     for batch in range(batches):
