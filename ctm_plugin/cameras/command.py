@@ -75,8 +75,8 @@ def place(folder: Path, settings: CamerasConfig) -> tuple[list[str], Trusted, fl
     except KeyboardInterrupt:
         raise KeyboardInterrupt("stopped; what was done is kept") from None
     except PermissionError as error:
-        trusted = f"a folder that cannot be written to ({error.strerror})"
-        raise DataError(root, trusted, "a copy of it: cameras are written next to the photographs") from error
+        found = f"a folder that cannot be written to ({error.strerror})"
+        raise DataError(root, found, "a copy of it: cameras are written next to the photographs") from error
     return names, trusted, gain
 
 

