@@ -24,7 +24,7 @@ BUDGETS = {
     "docs/cluster.md": 300,
     "docs/scenes.md": 700,
     "docs/benchmarks.md": 600,
-    "docs/notes/tried.md": 1500,
+    "docs/notes/tried.md": 300,
     "docs/citation.md": 200,
 }
 """Words of a page, all but those of generated tables."""

@@ -35,7 +35,7 @@ class Auto(log.Space):
       nearly black colours learn slowly.
     - Scenes whose level is 0.5 or more are sRGB to the last bit, unless a lamp keeps their median below ``lowest``.
 
-    What each is worth: ``docs/notes/tried.md``, colours.
+    What each is worth: ``docs/evidence/tried.csv``, colours.
     """
 
     Config = AutoConfig
