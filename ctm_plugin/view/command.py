@@ -24,8 +24,7 @@ def view(*runs: Path, settings: ViewConfig) -> None:
     - ``camera path`` keeps key frames, tries them, and saves them with the light for ``ctm render RUN_DIR
       path=FILE.json``.
 
-    The page is for this machine, unless ``host`` says otherwise. Then others need the whole address that is printed. It
-    is not encrypted: over a network that you do not trust, take ``ssh -L 8080:localhost:8080 MACHINE``.
+    Only this machine sees the page. On another one, ``ssh -L 8080:localhost:8080 MACHINE`` brings it.
 
     Raises:
         CTMError: viser is missing, or a run or the address cannot be used.

@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import io
-import secrets
 import socket
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stdout
 from functools import partial
-from hmac import compare_digest
-from http.cookies import SimpleCookie
 from typing import Any
-from urllib.parse import parse_qs, urlsplit
+from urllib.parse import urlsplit
 
 import viser
 from jaxtyping import Float
@@ -28,15 +25,14 @@ from ctm_plugin.view.sources import Subject, photographs
 
 POLL_S = 2.0
 """Most seconds from one check for a new checkpoint to the next."""
-LOCAL_HOSTS = ("127.0.0.1", "localhost", "::1")
-"""Hosts that no other machine reaches."""
+HOST = "127.0.0.1"
+"""Address of the page, which no other machine reaches."""
 CONTENT_POLICY = (
     "default-src 'self' data: blob:; "
     "script-src 'self' 'unsafe-inline' 'unsafe-eval' 'wasm-unsafe-eval' blob:; "
     "style-src 'self' 'unsafe-inline'"
 )
 """Content-Security-Policy: the browser loads nothing from other hosts than the page's."""
-COOKIE = "ctm_view"
 
 
 class Viewer:
@@ -44,10 +40,10 @@ class Viewer:
 
     Args:
         subjects: at least one.
-        settings: where to listen, and in which light to begin.
+        settings: the port, and in which light to begin.
 
     Attributes:
-        address: of the page, with its token where other machines reach it.
+        address: of the page.
 
     Raises:
         ConfigError: nothing can listen there.
@@ -56,8 +52,7 @@ class Viewer:
 
     def __init__(self, subjects: Sequence[Subject], settings: ViewConfig):
         check_same_scene(subjects)
-        host, port = settings.host, settings.port
-        check_free(host, port)
+        check_free(settings.port)
         self.subjects = dict(zip(names(subjects), subjects, strict=True))
         self.first = subjects[0]
         self.views = photographs(self.first.scene, self.first.run.module.constant_background().cpu())
@@ -67,10 +62,9 @@ class Viewer:
         self.renderings = Renderings()
         self.painter = Painter(self.renderings.paint, self._show)
         self._pages: dict[int, Page] = {}
-        token = None if host in LOCAL_HOSTS else secrets.token_urlsafe(16)
-        self.address = page_address(host, port, token)
-        with guarded(token), redirect_stdout(io.StringIO()):  # viser tells the address without the token
-            self.server = viser.ViserServer(host=host, port=port, label=self.first.scene.name, verbose=False)
+        self.address = f"http://{HOST}:{settings.port}/"
+        with guarded(), redirect_stdout(io.StringIO()):  # the verb prints the address
+            self.server = viser.ViserServer(host=HOST, port=settings.port, label=self.first.scene.name, verbose=False)
         self.server.request_share_url = lambda: None  # clients cannot have it open a tunnel to the internet
         self.server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
         self.server.gui.main_panel.dock_right()
@@ -132,63 +126,45 @@ def check_same_scene(subjects: Sequence[Subject]) -> None:
             )
 
 
-def check_free(host: str, port: int) -> None:
-    """Refuse an address that nothing can listen at; viser would wait for ever, or take another.
+def check_free(port: int) -> None:
+    """Refuse a port that nothing can listen at; viser would take another.
 
     Raises:
         ConfigError: so it is.
     """
     try:
-        socket.create_server((host, port)).close()
-    except (OSError, OverflowError) as error:
-        expected = f"an address to listen at ({error}); port=N is another"
-        raise ConfigError("host, port", f"{host}, {port}", expected) from error
+        socket.create_server((HOST, port)).close()
+    except OSError as error:
+        raise ConfigError("port", port, f"another port ({error})") from error
 
 
-def page_address(host: str, port: int, token: str | None) -> str:
-    """Address of the page: this machine's name where the server listens at all of its addresses."""
-    name = socket.gethostname() if host in ("0.0.0.0", "::") else f"[{host}]" if ":" in host else host
-    return f"http://{name}:{port}/" + (f"?token={token}" if token else "")
+def admitted(headers: Mapping[str, str]) -> bool:
+    """Whether to answer a request: it comes from the server's own page or from none, by this machine's own name.
 
-
-def admitted(path: str, headers: Mapping[str, str], token: str | None) -> bool:
-    """Whether to answer a request: it comes from the server's own page or from none, and it has the token.
-
-    Without a token the server has this machine's own names only: another name may be another site's.
+    Another name may be another site's.
     """
     host, origin = headers.get("Host", ""), headers.get("Origin")
     if origin is not None and urlsplit(origin).netloc != host:
         return False
-    if token is None:
-        return urlsplit(f"//{host}").hostname in LOCAL_HOSTS
-    cookie = SimpleCookie(headers.get("Cookie", "")).get(COOKIE)
-    given = [*parse_qs(urlsplit(path).query).get("token", []), cookie.value if cookie else ""]
-    return any(compare_digest(each.encode(), token.encode()) for each in given)
+    return urlsplit(f"//{host}").hostname in (HOST, "localhost")
 
 
 @contextmanager
-def guarded(token: str | None) -> Iterator[None]:
+def guarded() -> Iterator[None]:
     """A server that viser starts inside answers what is :func:`admitted`, and sends ``CONTENT_POLICY`` with its pages.
 
     By itself it lets pages of other sites connect, also where the site's name was made to mean this machine (DNS
-    rebinding), asks nobody who comes from another machine, and its page loads a script for statistics from elsewhere.
-
-    Args:
-        token: what the page must be asked for with, as ``/?token=TOKEN``; the browser then keeps it as a cookie.
-            ``None``: the server listens only to this machine.
+    rebinding), and its page loads a script for statistics from elsewhere.
     """
     serve = server.serve
 
     def with_guard(*args: Any, process_request: Callable[..., Any], **options: Any) -> Any:
         def answer(connection: Any, request: Any) -> Any:
-            if not admitted(request.path, request.headers, token):
-                return connection.respond(403, "this page wants the whole address that `ctm view` printed\n")
+            if not admitted(request.headers):
+                return connection.respond(403, "this page wants the address that `ctm view` printed\n")
             response = process_request(connection, request)
             if response is not None:
                 response.headers["Content-Security-Policy"] = CONTENT_POLICY
-                if token is not None:
-                    response.headers["Set-Cookie"] = f"{COOKIE}={token}; Path=/; HttpOnly; SameSite=Strict"
-                    response.headers["Referrer-Policy"] = "no-referrer"
             return response
 
         return serve(*args, process_request=answer, **options)

@@ -19,9 +19,8 @@ from forked import Command
         (["RUN", "port=99999"], "port: found 99999, expected an integer, 1 to 65535"),
         (["RUN", "port=TAKEN"], "Address already in use"),
         (["RUN", "port=many"], "port: found 'many'"),
-        (["RUN", "host=203.0.113.7"], "host, port: found '203.0.113.7, 8080', expected an address to listen at"),
-        (["RUN", "speed=2"], "speed: found an unknown key, expected one of contrast, dataset.root, host"),
-        (["RUN", "port=8080", "host"], "found 'host', expected key=value"),
+        (["RUN", "speed=2"], "speed: found an unknown key, expected one of contrast, dataset.root, light"),
+        (["RUN", "port=8080", "light"], "found 'light', expected key=value"),
         (["ctm=on"], "ctm=on: found no config.yaml"),  # a folder of that name is a run
     ],
 )
