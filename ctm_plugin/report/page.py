@@ -1,25 +1,19 @@
-"""The HTML report: one file, with tables, pictures and curves in it."""
+"""The HTML report: one file, with tables and pictures in it."""
 
 from __future__ import annotations
 
 import base64
-import io
 import itertools
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
 from urllib.parse import quote
 
 import imageio.v3 as iio
 import numpy as np
-from google.protobuf.message import DecodeError
 from jinja2 import Environment, PackageLoader
-from matplotlib.figure import Figure
-from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from ctm_plugin import __version__
-from ctm_plugin.errors import CheckpointError
 from ctm_plugin.report.cells import Table
 from ctm_plugin.report.labels import Found
 from ctm_plugin.report.pairs import pairs, picture, pictures, where_they_differ
@@ -28,11 +22,6 @@ from ctm_plugin.report.tables import by_scene, configurations
 from ctm_plugin.report.text import written
 from ctm_plugin.runs.rundir import PAGE
 
-CURVES = {"psnr/test_view": "PSNR of a test view, dB", "psnr/rgb": "PSNR of the training pixels, dB"}
-"""Tags of curves and their titles; the first that all runs have enough points of is drawn."""
-MIN_POINTS = 3
-"""Least number of points of a curve."""
-SPEED_TAG = "speed/ms_per_step"
 PICTURE_KINDS = ("lit", "dark", "latent", "depth", "warps", "patches", "fused")
 
 
@@ -61,7 +50,7 @@ def first_seeds(runs: Sequence[Run]) -> dict[str, list[Run]]:
 
 
 def scene_entry(scene: str, runs: Sequence[Run]) -> dict:
-    """Runs of a scene: the photograph and sliders between any two, the window where two differ most, curves.
+    """Runs of a scene: the photograph and sliders between any two, and the window where two differ most.
 
     First it shows plain RGB and ``ctm=auto``, or another transform where that is not there.
     """
@@ -87,7 +76,6 @@ def scene_entry(scene: str, runs: Sequence[Run]) -> dict:
             }
             for kind, of_kind in layers.items()
         ],
-        "curves": curves(dict(zip(scored, (run.folder for run in runs), strict=True))),
     }
 
 
@@ -109,61 +97,7 @@ def windows_of(pictures: Mapping[int, np.ndarray]) -> dict[str, list[int]]:
     return windows
 
 
-def embedded(content: np.ndarray | bytes) -> str:
-    """A picture, ``[H, W, 3]`` bytes or a PNG file's content, as a data URL."""
-    png = content if isinstance(content, bytes) else iio.imwrite("<bytes>", content, extension=".png")
+def embedded(content: np.ndarray) -> str:
+    """A picture, ``[H, W, 3]`` bytes, as a data URL."""
+    png = iio.imwrite("<bytes>", content, extension=".png")
     return f"data:image/png;base64,{base64.b64encode(png).decode()}"
-
-
-class Curve(NamedTuple):
-    """PSNR in the course of a training."""
-
-    steps: list[int]
-    minutes: list[float]
-    values: list[float]
-
-
-def curves(runs: Mapping[str, Path]) -> str | None:
-    """PSNR of runs, by name and folder, against steps and time, as a data URL; ``None`` where none has a curve."""
-    curves_by_run = {name: each for name, folder in runs.items() if (each := curves_of(folder))}
-    tags = [tag for tag in CURVES if curves_by_run and all(tag in each for each in curves_by_run.values())]
-    if not tags:
-        return None
-    tag = max(tags, key=lambda tag: min(MIN_POINTS, *(len(each[tag].steps) for each in curves_by_run.values())))
-    figure = Figure(figsize=(9, 2.8 + 0.16 * len(curves_by_run)), layout="constrained")  # the legend takes a line a run
-    over_steps, over_time = figure.subplots(1, 2, sharey=True)
-    for name, each in curves_by_run.items():
-        over_steps.plot(each[tag].steps, each[tag].values, label=name)
-        over_time.plot(each[tag].minutes, each[tag].values)
-    over_steps.set(xlabel="step", ylabel=CURVES[tag])
-    over_time.set(xlabel="training, minutes")
-    for label in figure.legend(loc="outside lower center", fontsize=7).get_texts():
-        label.set_parse_math(False)
-    out = io.BytesIO()
-    figure.savefig(out, format="png", dpi=110)
-    return embedded(out.getvalue())
-
-
-def curves_of(run: Path) -> dict[str, Curve]:
-    """The curves of :data:`CURVES` that TensorBoard has of a run, of two points and more.
-
-    Raises:
-        CheckpointError: its files are damaged.
-    """
-    folder = run / "tensorboard"
-    if not folder.is_dir():
-        return {}
-    events = EventAccumulator(str(folder), size_guidance={"scalars": 500, "images": 1, "tensors": 1, "histograms": 1})
-    try:
-        events.Reload()
-    except (DecodeError, ValueError, OverflowError, MemoryError) as error:  # lengths that a file claims are believed
-        raise CheckpointError(folder, f"no readable curves ({type(error).__name__})", "TensorBoard's files") from error
-    points = {tag: events.Scalars(tag) for tag in (*CURVES, SPEED_TAG) if tag in events.Tags()["scalars"]}
-    clock = [(0, 0.0), *((point.step, point.value / 60_000) for point in points.pop(SPEED_TAG, []))]
-    steps, each = (np.array(column, dtype=float) for column in zip(*clock, strict=True))
-    minutes = np.cumsum(each * np.diff(steps, prepend=0))  # only of the training: a run may have waited
-    return {
-        tag: Curve(at, np.interp(at, steps, minutes).tolist(), [point.value for point in of_tag])
-        for tag, of_tag in points.items()
-        if len(at := [point.step for point in of_tag]) > 1
-    }

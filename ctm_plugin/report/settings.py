@@ -21,8 +21,8 @@ class ReportConfig(Settings):
     )
     format: str = setting(
         "md",
-        "format of tables: md, csv, latex or html",
-        choices=("md", "csv", "latex", "html"),
+        "format of tables: md, csv or html",
+        choices=("md", "csv", "html"),
     )
     out: str | None = setting(
         None,

@@ -1,11 +1,10 @@
-"""Tables as Markdown, CSV, LaTeX and HTML; what a cell says is one for all formats."""
+"""Tables as Markdown, CSV and HTML; what a cell says is one for all formats."""
 
 from __future__ import annotations
 
 import csv
 import io
 import math
-import re
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -20,7 +19,7 @@ PAIRED = (
     "Differences of the same scene and seed, converged or not: mean, 95 % confidence interval (Student's t), pairs in "
     "brackets. Better or worse: the interval leaves 0 out."
 )
-RANK_MARKS = {"md": ("**{}**", "_{}_"), "latex": (r"\textbf{{{}}}", r"\underline{{{}}}"), "html": ("{} ●", "{} ○")}
+RANK_MARKS = {"md": ("**{}**", "_{}_"), "html": ("{} ●", "{} ○")}
 """Templates that mark the best and the second best of a column by format."""
 RANK_LEGENDS = {"md": ("**Best**", "_second best_"), "html": ("● best", "○ second best")}
 """Words that explain these marks by format."""
@@ -45,9 +44,7 @@ def spread(mean: float, std: float | None, decimals: int, sign: str = "") -> str
 def written(table: Table, form: str) -> Written:
     """A table as text for a format of :data:`RANK_MARKS`."""
     lines = [_headings(table), *(_line(table, *row, ("{}", *RANK_MARKS[form])) for row in table.rows)]
-    about = ABOUT.format(*RANK_LEGENDS.get(form, RANK_LEGENDS["md"])) + (
-        PAPERS.format(data=table.data) if table.data else ""
-    )
+    about = ABOUT.format(*RANK_LEGENDS[form]) + (PAPERS.format(data=table.data) if table.data else "")
     below = [NOT_CONVERGED] if any("N.C." in cell for line in lines[1:] for cell in line) else []
     several = any(each.pairs > 1 for _, cells in table.rows for cell in cells for each in cell.differences)
     note = PAIRED if several else ONE_SEED
@@ -140,34 +137,8 @@ def csv_text(tables: Sequence[Table]) -> str:
     return out.getvalue()
 
 
-def latex(table: Table) -> str:
-    """A ``booktabs`` table."""
-    text, heads = written(table, "latex"), ["ours", "paper", "diff."] if table.data else ["ours"]
-    groups = " & ".join(
-        rf"\multicolumn{{{len(heads)}}}{{c}}{{{_escaped(f'{each.label} {METRICS[each.metric].arrow}')}}}"
-        for each in table.columns
-    )
-    return "\n".join(
-        [
-            r"\begin{table}", r"\centering",
-            rf"\caption{{{_escaped(table.title)}. {_escaped(' '.join([*table.notes, *text.below]))}}}",
-            rf"\begin{{tabular}}{{l{'r' * len(heads) * len(table.columns)}}}", r"\toprule",
-            rf" & {groups} \\", " & ".join(["", *(heads * len(table.columns))]) + r" \\", r"\midrule",
-            *(" & ".join(map(_escaped, line)) + r" \\" for line in text.lines[1:]),
-            r"\bottomrule", r"\end{tabular}", r"\end{table}", "",
-        ]
-    )  # fmt: skip
-
-
-def _escaped(text: str) -> str:
-    """For LaTeX, whose marks are kept."""
-    text = re.sub(r"([&%#_])", r"\\\1", text).replace("±", r"$\pm$")
-    return text.replace("↑", r"$\uparrow$").replace("↓", r"$\downarrow$")
-
-
 FORMATS = {
     "md": lambda tables: "\n".join(map(markdown, tables)),
     "csv": csv_text,
-    "latex": lambda tables: "\n".join(map(latex, tables)),
 }
 """Function that writes tables as text by format."""

@@ -1,50 +1,9 @@
-"""What the HTML page shows of runs: pictures beside the photograph, and their curves."""
+"""What the HTML page shows of runs: pictures beside the photograph, and any two of them."""
 
 import numpy as np
-import pytest
-from torch.utils.tensorboard import SummaryWriter
 
 from ctm_plugin.report.labels import find_runs
-from ctm_plugin.report.page import Curve, curves, curves_of, first_seeds, scene_entry, windows_of
-
-
-def log(folder, **curves: list[float]) -> None:
-    """Write curves with a point every two steps, of which each takes a minute."""
-    with SummaryWriter(folder / "tensorboard") as writer:
-        for index in range(max(map(len, curves.values()))):
-            writer.add_scalar("speed/ms_per_step", 60_000, 2 * index)
-        for tag, values in curves.items():
-            for index, value in enumerate(values):
-                writer.add_scalar(tag.replace("_", "/", 1), value, 2 * index)
-
-
-def test_curves_over_steps_and_time(tmp_path):
-    log(tmp_path, psnr_test_view=[20.0], psnr_rgb=[1.0, 2.0, 3.0], loss_total=[1.0, 2.0])
-    assert curves_of(tmp_path) == {"psnr/rgb": Curve([0, 2, 4], [0.0, 2.0, 4.0], [1.0, 2.0, 3.0])}
-
-
-@pytest.mark.parametrize(
-    ("points", "title"),
-    [
-        ([(3, 3), (3, 9)], "PSNR of a test view, dB"),
-        ([(3, 3), (2, 9)], "PSNR of the training pixels, dB"),  # two points are no course
-        ([(2, 1), (2, 9)], "PSNR of a test view, dB"),
-    ],
-)
-def test_all_runs_are_drawn_by_the_curve_that_all_have(tmp_path, monkeypatch, points, title):
-    drawn = []
-    monkeypatch.setattr("ctm_plugin.report.page.Figure.savefig", lambda figure, *_, **__: drawn.append(figure))
-    for name, (views, pixels) in zip("ab", points, strict=True):
-        log(tmp_path / name, psnr_test_view=[20.0] * views, psnr_rgb=[10.0] * pixels)
-    assert curves({name: tmp_path / name for name in "ab"} | {"none": tmp_path}).startswith("data:image/png")
-    over_steps, over_time = drawn[0].axes
-    assert over_steps.get_ylabel() == title
-    assert len(over_steps.lines) == len(over_time.lines) == 2
-
-
-def test_no_curves(tmp_path):
-    assert curves_of(tmp_path) == {}
-    assert curves({"a": tmp_path}) is None
+from ctm_plugin.report.page import first_seeds, scene_entry, windows_of
 
 
 def test_a_single_run_beside_the_photograph(made):

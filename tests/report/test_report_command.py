@@ -5,7 +5,7 @@ import io
 from html.parser import HTMLParser
 
 import pytest
-from mutations import put
+from strangers import put
 
 from ctm_plugin import cli
 
@@ -45,16 +45,6 @@ def test_the_papers_values_are_of_its_data_or_asked_for(made, capsys):
     ):  # fmt: skip
         assert main(list(map(str, arguments))) == 0
         assert ("| 31.67 |" in capsys.readouterr().out) == there
-
-
-def test_latex_is_balanced_and_escaped(table4, made, capsys):
-    assert main([str(table4), "table=4", "data=RawNeRF", "format=latex"]) == 0
-    text = capsys.readouterr().out
-    assert text.count("{") == text.count("}")
-    assert r"still\_life" in text
-    assert r"\textbf{33.50 $\pm$ 0.71 (2)}" in text
-    body = text.split(r"\midrule")[1].split(r"\bottomrule")[0]
-    assert all(line.count("&") == 9 for line in body.strip().splitlines())
 
 
 def test_html_is_one_file(table4, tmp_path):
