@@ -2,25 +2,22 @@
 
 from __future__ import annotations
 
-import csv
 import os
 import re
 import secrets
-import shutil
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from filelock import FileLock
-from lightning.pytorch.loggers import CSVLogger, MLFlowLogger, TensorBoardLogger, WandbLogger
+from lightning.pytorch.loggers import TensorBoardLogger, WandbLogger
 from PIL import Image
 from torch import Tensor
 
 from ctm_plugin.data.readers.images import to_8_bits
 from ctm_plugin.errors import CheckpointError
 from ctm_plugin.loggers.base import RunLogger, final
-from ctm_plugin.loggers.settings import MLflowConfig, WandBConfig
+from ctm_plugin.loggers.settings import WandBConfig
 from ctm_plugin.metrics.table import METRICS
 
 BINS = np.linspace(0, 1, 65)
@@ -39,31 +36,6 @@ CHARTS = {
 """Charts that TensorBoard gets besides those of metrics, as regular expressions over tags."""
 TRAIN_CHARTS = {"": r"psnr/rgb$", " in the latent space": r"psnr/latent$"}
 """Charts of the training's PSNR by what follows their title."""
-
-
-class CSV(RunLogger, CSVLogger):
-    """Only curves, as a table: `csv/metrics.csv` in the run's folder, with one row a logged step."""
-
-    def __init__(self, config: RunLogger.Config, run: Path, step: int):
-        super().__init__(run, name="", version="csv")
-        self.last = step
-
-    def open(self) -> None:
-        """Begin the table with the rows that a resumed run goes on from, as Lightning's deletes them."""
-        path, rows = Path(self.log_dir, "metrics.csv"), []
-        if self.last and path.is_file():
-            try:
-                with path.open(encoding="utf-8", newline="") as file:
-                    rows = [row for row in csv.DictReader(file, strict=True) if int(row["step"]) <= self.last]
-            except (LookupError, TypeError, ValueError, csv.Error) as error:
-                found = f"no readable curves ({type(error).__name__})"
-                raise CheckpointError(path, found, "rows with a step") from error
-        shutil.rmtree(self.log_dir, ignore_errors=True)
-        super().open()
-        for row in rows:
-            step = int(row.pop("step"))
-            self.log_metrics({name: cell for name, cell in row.items() if name and cell}, step)
-        self.save()
 
 
 class TensorBoard(RunLogger, TensorBoardLogger):
@@ -157,35 +129,6 @@ class WandB(RunLogger, WandbLogger):
 
     def close(self) -> None:
         self.experiment.finish()  # or the next run of a sweep would go on with it
-
-
-class MLflow(RunLogger, MLFlowLogger):
-    """MLflow, to `MLFLOW_TRACKING_URI`, else a folder `mlflow` in the run's or its sweep's (needs the extra `mlflow`).
-
-    A resumed run goes on by the id in ``RUN/mlflow.txt``.
-    """
-
-    Config = MLflowConfig
-
-    def __init__(self, config: Config, run: Path, step: int):
-        self.kept, self.home = run / "mlflow.txt", run.parent if sweep_of(run) else run
-        os.environ.setdefault("MLFLOW_ALLOW_FILE_STORE", "true")  # or MLflow >= 3.7 refuses a folder
-        super().__init__(
-            config.experiment,
-            run_name=run.name,
-            tags={"sweep": sweep_of(run)} if sweep_of(run) else None,
-            tracking_uri=os.environ.get("MLFLOW_TRACKING_URI"),
-            save_dir=str(self.home / "mlflow"),
-            run_id=kept_id(self.kept),
-        )
-
-    def open(self) -> None:
-        with FileLock(self.home / ".mlflow.lock"):  # two of a sweep's runs at once would both make the experiment
-            self.kept.write_text(self.run_id, encoding="utf-8")
-
-    def log_pictures(self, pictures: Mapping[str, Tensor], step: int) -> None:
-        for name, picture in pictures.items():
-            self.experiment.log_image(self.run_id, image(picture), key=name, step=step)
 
 
 def sweep_of(run: Path) -> str | None:

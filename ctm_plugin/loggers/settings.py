@@ -16,10 +16,3 @@ class WandBConfig(Settings, section="logger"):
         "offline", "offline: files for `wandb sync`; online: straight to the service", choices=("offline", "online")
     )
     group: str | None = setting(None, "name of a group of runs; null: a sweep's folder, and no group for single runs")
-
-
-@dataclass(frozen=True, kw_only=True)
-class MLflowConfig(Settings, section="logger"):
-    """Where runs go."""
-
-    experiment: str = setting("ctm_plugin", "experiment that runs are put into")

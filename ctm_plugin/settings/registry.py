@@ -184,7 +184,7 @@ METRICS_OF_OTHERS = Registry("metric", "ctm_plugin.metrics", {})
 LOGGERS = Registry(
     "logger",
     "ctm_plugin.loggers",
-    {name.lower(): f"ctm_plugin.loggers.services:{name}" for name in ("CSV", "MLflow", "TensorBoard", "WandB")},
+    {name.lower(): f"ctm_plugin.loggers.services:{name}" for name in ("TensorBoard", "WandB")},
 )
 CALLBACKS = Registry(
     "callback",

@@ -1,21 +1,18 @@
 """Loggers and callbacks out of the configuration: ours, another package's, and none."""
 
-import csv
 import json
-import shutil
 import sys
 from pathlib import Path
 
 import pytest
 import torch
-from lightning.pytorch.loggers import mlflow, wandb
-from omegaconf import OmegaConf
+from lightning.pytorch.loggers import wandb
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from ctm_plugin.backbones.base import Backbone
 from ctm_plugin.cli import main
 from ctm_plugin.errors import CheckpointError, ConfigError, CTMError
-from ctm_plugin.loggers.services import CSV, kept_id
+from ctm_plugin.loggers.services import TensorBoard, kept_id
 from ctm_plugin.runs.assemble import assemble
 from ctm_plugin.runs.evaluate import evaluate
 from ctm_plugin.runs.rundir import LAST, METRICS, load_config
@@ -48,13 +45,13 @@ def die(monkeypatch):
 
 
 def test_a_bug_in_a_logger_is_shown(tmp_path):
-    class Broken(CSV):
+    class Broken(TensorBoard):
         @property
         def experiment(self):
             raise AttributeError("no such field")
 
     with pytest.raises(AttributeError, match="no such field"):
-        Broken(CSV.Config(), tmp_path, 0).open()
+        Broken(TensorBoard.Config(), tmp_path, 0).open()
 
 
 # Another package's
@@ -93,17 +90,19 @@ def test_what_another_package_keeps_outlives_an_interruption(installed, compose,
     assert {began for _, _, began, _ in notes(run / "notes.txt")} == {0, 3}
     monkeypatch.setattr(sys, "path", [path for path in sys.path if not path.endswith("outside")])
     evaluate(run)  # a run is scored without their package
-    with pytest.raises(CTMError, match="unknown logger 'notes'; known: csv, mlflow, tensorboard, wandb"):
+    with pytest.raises(CTMError, match="unknown logger 'notes'; known: tensorboard, wandb"):
         resume(run)
 
 
 def test_what_a_callback_logs_is_there_once_at_the_steps_of_the_rest(installed, compose, die, tmp_path):
-    config = compose(*SMALL, *EVERY, "logger=csv", "+callbacks.count={}")
+    config = compose(*SMALL, *EVERY, "+callbacks.count={}")
     die(config, tmp_path / "run", 4)
     resume(tmp_path / "run")
-    counts = [(row["step"], float(row["theirs/batches"])) for row in rows(tmp_path / "run") if "theirs/batches" in row]
-    assert counts == [(str(step), step) for step in range(1, 7)]
-    assert not any("epoch" in row for row in rows(tmp_path / "run"))
+    told = curves(tmp_path / "run")
+    assert [point for point in told if point[0] == "theirs/batches"] == [
+        ("theirs/batches", step, step) for step in range(1, 7)
+    ]
+    assert not any(tag == "epoch" for tag, *_ in told)
 
 
 @pytest.mark.parametrize(
@@ -114,7 +113,7 @@ def test_what_a_callback_logs_is_there_once_at_the_steps_of_the_rest(installed, 
         ("callbacks.film.frames=0", "callbacks.film.frames: found 0, expected an integer >= 1"),
         ("trainer.image_every=0", "trainer.image_every: found 0, expected an integer >= 1 or null"),
         ("+callbacks.film._target_=os.getcwd", "callbacks.film._target_: found an unknown key, expected one of"),
-        ("logger=mine", "logger: found 'mine', expected one of csv, mlflow, none, tensorboard, wandb"),
+        ("logger=mine", "logger: found 'mine', expected one of none, tensorboard, wandb"),
         ("+logger.x=1", "logger.x: found an unknown key, expected no settings"),
     ],
 )
@@ -139,55 +138,27 @@ def test_a_stranger_names_no_code(compose, tmp_path, group, monkeypatch):
 TIMED = ("speed/", "final/train_seconds", "final/rays_per_second", "final/peak_memory_mb")
 
 
-def rows(run: Path) -> list[dict[str, str]]:
-    """Of the table, but for what took time."""
-    with (run / "csv" / "metrics.csv").open() as file:
-        found = list(csv.DictReader(file))
-    return [
-        {name: value for name, value in sorted(row.items()) if value and not name.startswith(TIMED)} for row in found
-    ]
-
-
-@pytest.fixture(scope="module")
-def table(compose, tmp_path_factory) -> tuple[dict, Path]:
-    """A configuration with a table of curves, and its run that nothing interrupted."""
-    config, run = compose(*SMALL, *EVERY, "logger=csv"), tmp_path_factory.mktemp("whole") / "run"
-    train(config, run)
-    return config, run
-
-
-def test_csv_is_what_tensorboard_has_and_none_changes_nothing(table, compose, tmp_path):
-    config, run = table
-    settings = OmegaConf.load(run / "csv" / "hparams.yaml")
-    assert (settings["backbone"], settings["seed"]) == ("dvgo", config["seed"])
-    assert [int(row["step"]) for row in rows(run) if "loss/total" in row] == [1, 2, 3, 4, 5, 6]
-    assert [int(row["step"]) for row in rows(run) if "psnr/test_view" in row] == [0, 2, 4, 6]
-    watched = train(compose(*SMALL, *EVERY), tmp_path / "run")
-    folder = tmp_path / "run" / "tensorboard"  # the row of scores has one of its own
+def curves(run: Path) -> list[tuple[str, int, float]]:
+    """Tag, step and value of all that TensorBoard has, but for what took time."""
+    folder = run / "tensorboard"  # the row of scores has one of its own
     both = [EventAccumulator(str(each), {"scalars": 0}).Reload() for each in (folder, folder / "final")]
-    told = {(tag, e.step): e.value for events in both for tag in events.Tags()["scalars"] for e in events.Scalars(tag)}
-    written = {(name, int(row["step"])): float(row[name]) for row in rows(run) for name in row if name != "step"}
-    assert written == pytest.approx({key: value for key, value in told.items() if not key[0].startswith(TIMED)})
-    assert train(compose(*SMALL, *EVERY, "logger=none"), tmp_path / "none")["psnr"] == watched["psnr"]
-    folders = [{path.name for path in (tmp_path / name).iterdir()} for name in ("none", "run")]
-    assert folders[1] - folders[0] == {"tensorboard"}
+    told = [(tag, e.step, e.value) for events in both for tag in events.Tags()["scalars"] for e in events.Scalars(tag)]
+    return [point for point in told if not point[0].startswith(TIMED)]
 
 
-def test_a_resumed_table_has_every_row_once(table, die, tmp_path):
-    config, whole = table
+def test_a_resumed_run_has_every_point_once_and_no_logger_changes_nothing(compose, die, tmp_path):
+    config = compose(*SMALL, *EVERY)
+    result = train(config, tmp_path / "whole")
+    told = curves(tmp_path / "whole")
+    assert [step for tag, step, _ in told if tag == "loss/total"] == [1, 2, 3, 4, 5, 6]
+    assert [step for tag, step, _ in told if tag == "psnr/test_view"] == [0, 2, 4, 6]
     die(config, tmp_path / "run", 4)
-    assert max(int(row["step"]) for row in rows(tmp_path / "run")) == 4
     for _ in range(2):  # the second time scored again
         resume(tmp_path / "run")
-        assert rows(tmp_path / "run") == rows(whole)
-
-
-@pytest.mark.parametrize("content", ["a,b\n1,2\n", "step\nx\n", "step\n1\n" + "9" * 5000, "\xff"])
-def test_a_strangers_table(table, tmp_path, content):
-    run = Path(shutil.copytree(table[1], tmp_path / "run"))
-    (run / "csv" / "metrics.csv").write_bytes(content.encode("latin-1"))
-    with pytest.raises(CheckpointError, match=r"metrics.csv: found no readable curves \(\w+\), expected rows with a"):
-        resume(run)
+        assert curves(tmp_path / "run") == told
+    assert train(compose(*SMALL, *EVERY, "logger=none"), tmp_path / "none")["psnr"] == result["psnr"]
+    folders = [{path.name for path in (tmp_path / name).iterdir()} for name in ("none", "whole")]
+    assert folders[1] - folders[0] == {"tensorboard"}
 
 
 # Services, which need not be installed
@@ -200,12 +171,11 @@ def test_a_strangers_id(tmp_path, content):
         kept_id(tmp_path / "wandb.txt")
 
 
-@pytest.mark.parametrize("name", ["wandb", "mlflow"])
-def test_a_missing_package_is_told_with_its_extra(compose, tmp_path, name, monkeypatch):
+def test_a_missing_package_is_told_with_its_extra(compose, tmp_path, monkeypatch):
     monkeypatch.setattr("ctm_plugin.runs.assemble.load_scene", lambda *_: pytest.fail("data is read"))
-    monkeypatch.setattr({"wandb": wandb, "mlflow": mlflow}[name], f"_{name.upper()}_AVAILABLE", False)
-    with pytest.raises(ConfigError, match=rf"logger: found '{name}', expected .*pip install -e '.\[{name}\]'"):
-        train(compose(*SMALL, f"logger={name}"), tmp_path / "run")
+    monkeypatch.setattr(wandb, "_WANDB_AVAILABLE", False)
+    with pytest.raises(ConfigError, match=r"logger: found 'wandb', expected .*pip install -e '.\[wandb\]'"):
+        train(compose(*SMALL, "logger=wandb"), tmp_path / "run")
     assert not (tmp_path / "run").exists()
 
 

@@ -1,4 +1,4 @@
-"""Weights & Biases and MLflow themselves, into files, where they are installed."""
+"""Weights & Biases itself, into files, where it is installed."""
 
 import struct
 from collections.abc import Iterator
@@ -15,7 +15,7 @@ PICTURES = ("trainer.image_every=2",)
 @pytest.fixture
 def run(tmp_path, monkeypatch) -> Path:
     """Where a sweep's run goes; nothing of this machine's own settings is asked."""
-    for name in ("WANDB_DIR", "WANDB_MODE", "MLFLOW_TRACKING_URI"):
+    for name in ("WANDB_DIR", "WANDB_MODE"):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setenv("WANDB_SILENT", "true")
     monkeypatch.chdir(tmp_path)
@@ -58,19 +58,3 @@ def test_wandb_offline(compose, run):
     assert began.run_id == known
     resume(run)
     assert (run / "wandb.txt").read_text() == known
-
-
-def test_mlflow_s_file_store(compose, run):
-    mlflow = pytest.importorskip("mlflow", reason="not installed: pip install -e '.[mlflow]'")
-
-    result = train(compose(*SMALL, *PICTURES, "logger=mlflow"), run)
-    resume(run)
-    train(compose(*SMALL, "trainer.image_every=null", "logger=mlflow"), run.with_name("1"))
-    client = mlflow.tracking.MlflowClient(f"file:{run.parent / 'mlflow'}")
-    other, found = client.search_runs([client.get_experiment_by_name("ctm_plugin").experiment_id])
-    assert (other.info.run_name, other.data.tags["sweep"]) == ("1", "sweep")
-    assert (found.info.run_name, found.data.tags["sweep"], found.data.params["dataset"]) == ("0", "sweep", "ball")
-    assert found.data.metrics["final/psnr"] == pytest.approx(result["psnr"])
-    assert [each.step for each in client.get_metric_history(found.info.run_id, "loss/total")] == [2, 4]
-    pictures = [each.path for each in client.list_artifacts(found.info.run_id, "images") if "render" in each.path]
-    assert len([path for path in pictures if path.endswith(".png")]) == 3
