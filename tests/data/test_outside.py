@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from ctm_scenes.trajectory import hemisphere
 from layouts import MAKE, write_images
-from mutations import Payload
+from strangers import Payload
 
 from ctm_plugin.errors import DataError
 from ctm_plugin.settings.build import build

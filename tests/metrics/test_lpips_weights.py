@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from mutations import Payload
+from strangers import Payload
 
 from ctm_plugin.errors import DataError
 from ctm_plugin.metrics import lpips_weights

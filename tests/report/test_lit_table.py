@@ -1,7 +1,7 @@
 """The table of lit views: every cell where it belongs, nothing beside what it cannot be compared with."""
 
 import pytest
-from mutations import put
+from strangers import put
 
 from ctm_plugin.cli import main
 from ctm_plugin.report.labels import find_runs

@@ -1,7 +1,7 @@
 """Reading a run directory: its setting, and everything that is none."""
 
 import pytest
-from mutations import put
+from strangers import put
 
 from ctm_plugin.report.labels import find_runs
 from ctm_plugin.report.runs import read_run

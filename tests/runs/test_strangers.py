@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from mutations import Payload, put
+from strangers import Payload, put
 
 from ctm_plugin import __version__, cli
 from ctm_plugin.errors import CheckpointError, CTMError, DataError
