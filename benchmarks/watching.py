@@ -1,8 +1,8 @@
 """The share of a run's wall clock that goes into what a person sees of it while it trains.
 
 ``python benchmarks/watching.py [+]group=choice key=value ...``, as on the command line of ``ctm_plugin``; the run lies
-in a temporary folder. Every method with which Lightning calls the dashboard, the progress line and the film is timed,
-and the validations, whose pictures the dashboard shows.
+in a temporary folder. Every method with which Lightning calls the dashboard and the progress line is timed, and
+the validations, whose pictures the dashboard shows.
 """
 
 from __future__ import annotations
@@ -16,7 +16,6 @@ from pathlib import Path
 
 from ctm_plugin.backbones.base import Backbone
 from ctm_plugin.callbacks.dashboard import Dashboard
-from ctm_plugin.callbacks.film import Film
 from ctm_plugin.callbacks.progress import ProgressLine
 from ctm_plugin.runs.compose import compose
 from ctm_plugin.runs.train import train
@@ -40,7 +39,7 @@ def timed(kind: type, spent: Counter[str], hooks: tuple[str, ...] = ("on_", "tea
 
 def main() -> None:
     spent: Counter[str] = Counter()
-    for kind in (Dashboard, ProgressLine, Film):
+    for kind in (Dashboard, ProgressLine):
         timed(kind, spent)
     timed(Backbone, spent, ("validation_step",))
     config = compose(*sys.argv[1:])

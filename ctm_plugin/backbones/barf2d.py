@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 from torch.optim import Adam, Optimizer
@@ -227,14 +226,6 @@ class BARF2D(Backbone):
         shown = compared(self.decode(latent).cpu(), target, latent.float().cpu(), scene.exposure, light)
         shown.pictures["test/warps"] = self._outlined(light)[::2, ::2]
         return shown
-
-    @torch.no_grad()
-    def film(self) -> Float[Tensor, "h w 3"]:
-        """Draw the outlines next to the fused picture, at half size, both lit."""
-        every = max(2, self.stride(self.scene.height, self.scene.width))
-        fused = self.light.apply(self.decode(self.render_image(every)).float().cpu())
-        outlined = self._outlined(self.light)[::2, ::2]
-        return beside(outlined, F.interpolate(fused.permute(2, 0, 1)[None], outlined.shape[:2])[0].permute(1, 2, 0))
 
     def _outlined(self, light: Light) -> Float[Tensor, "h w 3"]:
         """The whole picture, lit, under the outlines of the patches."""

@@ -11,7 +11,6 @@ from typing import Any, NamedTuple
 
 import lightning as L
 import torch
-from jaxtyping import Float
 from lightning.pytorch.strategies import DDPStrategy
 from torch import Tensor
 from torch.optim import Optimizer
@@ -78,7 +77,7 @@ class Backbone(L.LightningModule):
 
     A subclass gives ``total_steps``, ``draw``, ``scene_colors``, ``predict``, ``field_optimizers`` and, if it has
     any, ``regularisers``, ``field_schedule`` and ``color_biases``; its ``Config`` dataclass is the backbone's part of
-    the configuration. What it is scored by, shows and films is its own: ``scores``, ``snapshot``, ``film``.
+    the configuration. What it is scored by and shows is its own: ``scores``, ``snapshot``.
     ``appearance`` is what tells the training pictures apart, ``None`` where nothing does.
 
     Args:
@@ -171,10 +170,6 @@ class Backbone(L.LightningModule):
     def snapshot(self, view: int) -> Snapshot:
         """Render a test view, small, next to its target; called in evaluation mode, without gradients."""
         return Snapshot()
-
-    def film(self) -> Float[Tensor, "h w 3"] | None:
-        """A picture of the training, some twenty of which become a film; ``None``: there is none."""
-        return None
 
     def cost(self, first: int | float, last: int | float) -> float:
         """How long a step takes from a place of its schedule to another, on average, relative to others of it."""

@@ -192,7 +192,6 @@ CALLBACKS = Registry(
     {
         "progress": "ctm_plugin.callbacks.progress:ProgressLine",
         "dashboard": "ctm_plugin.callbacks.dashboard:Dashboard",
-        "film": "ctm_plugin.callbacks.film:Film",
     },
 )
 REGISTRIES = {

@@ -21,7 +21,6 @@ from ctm_plugin.runs.evaluate import evaluate
 from ctm_plugin.runs.rundir import LAST, METRICS
 from ctm_plugin.runs.train import resume, train
 from ctm_plugin.scene.views import PlanarScene
-from ctm_plugin.show.pictures import write_png
 
 SIZE = {"height": 30, "width": 40, "patch": 12}
 
@@ -218,16 +217,12 @@ def test_an_interrupted_run_ends_as_a_whole_one(compose, overrides, tmp_path, ct
     scores = [json.loads((tmp_path / name / METRICS).read_text()) for name in ("whole", "run")]
     for key in ("warp_error", "psnr", "corner_error"):
         assert scores[0][key] == scores[1][key]
-    films = [sorted(path.name for path in (tmp_path / name / "film").iterdir()) for name in ("whole", "run")]
-    assert films[0] == films[1] == [f"{step:06d}.png" for step in range(10)]
 
 
 def test_a_run_directory(compose, overrides, tmp_path):
     result = train(compose(*overrides, "dataset.exposure=0.1"), tmp_path)
     names = {path.stem for path in (tmp_path / "lit").iterdir()}
     assert names == {"warps", "patches", "fused", "latent"}
-    assert len(iio.improps(tmp_path / "film.gif", index=None).shape) == 4
-    assert 2 <= iio.improps(tmp_path / "film.gif", index=None).shape[0] <= 10  # frames alike are one
     assert result["dataset"] == "spots"
     assert len(result["per_patch"]) == 5
     assert result["per_patch"][0]["warp_error"] == 0
@@ -236,12 +231,6 @@ def test_a_run_directory(compose, overrides, tmp_path):
     assert "exposure 0.1" in result["protocol"]
     again = evaluate(tmp_path)
     assert all(again[key] == result[key] for key in ("warp_error", "psnr", "image_psnr"))
-
-
-def test_a_strange_frame_is_left_out_of_the_film(compose, overrides, tmp_path):
-    write_png(tmp_path / "film" / "0.png", torch.zeros(3, 5, 3))
-    train(compose(*overrides, "ctm=off"), tmp_path)
-    assert iio.improps(tmp_path / "film.gif", index=0).shape != (3, 5, 3)
 
 
 @pytest.mark.parametrize("space", ["rgb", "lab", "hsv_cart", "log"])

@@ -63,7 +63,7 @@ def notes(path: Path) -> list[tuple]:
 
 def test_a_logger_and_a_callback_of_another_package(installed, arguments, tmp_path):
     run = tmp_path / "run"
-    theirs = ("logger=notes", "logger.file=mine.txt", "callbacks=count", "callbacks.count.by=2", "~callbacks.film")
+    theirs = ("logger=notes", "logger.file=mine.txt", "callbacks=count", "callbacks.count.by=2")
     assert main([*arguments, *SMALL, *EVERY, *theirs, "callbacks.progress=null", f"hydra.run.dir={run}"]) == 0
     assert {name for name, node in load_config(run)["callbacks"].items() if node is not None} == {"dashboard", "count"}
     told = notes(run / "mine.txt")
@@ -108,11 +108,10 @@ def test_what_a_callback_logs_is_there_once_at_the_steps_of_the_rest(installed, 
 @pytest.mark.parametrize(
     ("argument", "said"),
     [
-        ("+callbacks.nobody={}", "unknown callback 'nobody'; known: dashboard, film, progress"),
-        ("callbacks.film=3", "callbacks.film: found 3, expected settings, or null for none of it"),
-        ("callbacks.film.frames=0", "callbacks.film.frames: found 0, expected an integer >= 1"),
+        ("+callbacks.nobody={}", "unknown callback 'nobody'; known: dashboard, progress"),
+        ("callbacks.progress=3", "callbacks.progress: found 3, expected settings, or null for none of it"),
         ("trainer.image_every=0", "trainer.image_every: found 0, expected an integer >= 1 or null"),
-        ("+callbacks.film._target_=os.getcwd", "callbacks.film._target_: found an unknown key, expected one of"),
+        ("+callbacks.progress._target_=os.getcwd", "callbacks.progress._target_: found an unknown key, expected no"),
         ("logger=mine", "logger: found 'mine', expected one of none, tensorboard, wandb"),
         ("+logger.x=1", "logger.x: found an unknown key, expected no settings"),
     ],
