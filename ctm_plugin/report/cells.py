@@ -62,7 +62,7 @@ class Cell:
     not_converged: int = 0
     runs: int = 0
     paper: float | None = None
-    """The paper's value, or another that was published; ``math.nan``: N.C. there."""
+    """The paper's value; ``math.nan``: N.C. there."""
     rank: int = 0
     """Rank in the column: 1 for the best, 2 for the second best."""
     differences: list[Difference] = field(default_factory=list)
@@ -110,9 +110,9 @@ class Table:
         self.rows += [(before + label, cells) for (label, _), cells in zip(rows, grid, strict=True)]
 
 
-def columns_of(metrics: Iterable[str], runs: Sequence[Run], nets: Iterable[str] = ()) -> list[Column]:
-    """A column for each metric; one for each network of LPIPS where runs have several, or in addition to ``nets``."""
-    networks = sorted({run.metrics["lpips_net"] for run in runs if run.metrics.get("lpips_net")} | set(nets))
+def columns_of(metrics: Iterable[str], runs: Sequence[Run]) -> list[Column]:
+    """A column for each metric; one for each network of LPIPS where runs have several."""
+    networks = sorted({run.metrics["lpips_net"] for run in runs if run.metrics.get("lpips_net")})
     return [
         Column(f"{METRICS[metric].label} ({net})" if net else METRICS[metric].label, metric, net=net)
         for metric in metrics

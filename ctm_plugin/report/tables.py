@@ -24,8 +24,12 @@ DATA: dict[str, Any] = yaml.load((files(__package__) / "tables.yaml").read_text(
 """Contents of ``tables.yaml``."""
 PAPER: dict[int, dict[str, Any]] = {int(number): DATA["methods"] | table for number, table in DATA["tables"].items()}
 """The paper's tables by their number."""
-LIT_TABLE = DATA["lit"]
-"""Published scores of lit views."""
+LIT_METRICS = ("psnr_lit", "ssim_lit", "lpips_lit")
+"""Scores of lit views."""
+LIT_NOTE = (
+    "Lit: rendered dark, in one light that is found from the training pictures, against pictures in normal light. "
+    "Fitted: after one affine map of colours fitted to these very pictures, no method's score."
+)
 NO_CTM = {"ctm": "off"} | UNNAMED_VALUES
 """Values of the row that others are compared with, where there are such runs."""
 Named = Iterator[tuple[str, list[Run]]]
@@ -164,27 +168,17 @@ def _best_closed_form(rows: Rows, setting: Setting, column: Column) -> tuple[str
 def lit_views(runs: Sequence[Run]) -> Table:
     """Scores of lit views, scene by scene and on the mean.
 
-    Each scene has a row a setting; the dark photographs of the test views in the same light, a yardstick; each
-    setting with the colour map that was fitted to the references, an oracle; and of LOM's scenes the published values.
+    Each scene has a row a setting; the dark photographs of the test views in the same light, a yardstick; and each
+    setting with the colour map that was fitted to the references, an oracle.
     """
-    low = [run for run in runs if {"dark": "low", "lit": "high"}.items() <= run.config["dataset"].items()]
-    lom = {run.scene for run in low} & LIT_TABLE["values"].keys()
     fitted = ["psnr_fitted"] * any(run.setting["appearance"] != "none" for run in runs)
-    columns = columns_of([*LIT_TABLE["metrics"], "psnr", *fitted], runs, [LIT_TABLE["net"]] * bool(lom))
-    table = Table(
-        "Lit views", columns, notes=[LIT_TABLE["note"], *[LIT_TABLE["published"]] * bool(lom), *notes_of(runs)]
-    )
+    columns = columns_of([*LIT_METRICS, "psnr", *fitted], runs)
+    table = Table("Lit views", columns, notes=[LIT_NOTE, *notes_of(runs)])
 
     def of(which: str, runs: Sequence[Run]) -> list[Cell]:
         """The same scores of other pictures, such as ``psnr_lit_photo``; there are none of other columns."""
-        metrics = [column.metric + which if column.metric in LIT_TABLE["metrics"] else "" for column in columns]
+        metrics = [column.metric + which if column.metric in LIT_METRICS else "" for column in columns]
         return [cell_of(runs, replace(each, metric=metric)) for each, metric in zip(columns, metrics, strict=True)]
-
-    def published(name: str) -> Iterator[tuple[str, list[Cell]]]:
-        for method, values in LIT_TABLE["values"][name].items():
-            known = dict(zip(LIT_TABLE["metrics"], map(float, values), strict=True))
-            theirs = [known.get(each.metric) if each.net in (None, LIT_TABLE["net"]) else None for each in columns]
-            yield f"{name}: {method}, as published", [Cell(paper=value) for value in theirs]
 
     for name, rows in blocks_of(configurations(runs)):
         table.add(rows, f"{name}: ")
@@ -194,8 +188,6 @@ def lit_views(runs: Sequence[Run]) -> Table:
         for label, members in rows:
             oracle = f"{name}: {label}, colours fitted to the references (an oracle)"
             table.rows.append((oracle, of("_fitted", members)))
-        table.rows += published(name) if name in lom else []
-    table.rows += published(LIT_TABLE["mean"]) if lom else []
     return table
 
 

@@ -8,18 +8,16 @@ from ctm_plugin.report.labels import find_runs
 from ctm_plugin.report.tables import all_runs, choose, lit_views
 from ctm_plugin.report.text import markdown
 
-LOM = {"name": "transforms", "root": "buu", "dark": "low", "lit": "high"}
-
 
 @pytest.fixture
 def lit(made):
-    """``lit(scene, *arguments, lom=True, **metrics)``: a run that was scored against references."""
+    """``lit(scene, *arguments, **metrics)``: a run that was scored against references."""
 
-    def make(scene: str, *arguments: str, lom: bool = True, **metrics):
+    def make(scene: str, *arguments: str, **metrics):
         scores = {"dataset": scene, "protocol": scene, "lpips_net": "alex", "psnr": 38.0, "lpips_lit": 0.2}
         scores |= {"psnr_lit": 22.0, "ssim_lit": 0.8, "psnr_lit_fitted": 26.0, "psnr_lit_photo": 25.1} | metrics
         folder = made(*arguments, **scores)
-        for key, value in (LOM if lom else {"name": "transforms", "root": scene}).items():
+        for key, value in {"name": "transforms", "root": scene}.items():
             put(folder / "config.yaml", f"dataset.{key}", value)
         return folder
 
@@ -27,8 +25,7 @@ def lit(made):
 
 
 def rows(table):
-    return {label: [cell.mean if cell.paper is None else cell.paper for cell in cells]
-            for label, cells in table.rows}  # fmt: skip
+    return {label: [cell.mean for cell in cells] for label, cells in table.rows}
 
 
 def test_a_scene(lit):
@@ -36,30 +33,20 @@ def test_a_scene(lit):
     folder = lit("buu", "ctm=quick", psnr_lit=23.0)
     table = lit_views(find_runs([folder.parent]).runs)
     assert [column.label for column in table.columns] == [
-        "PSNR, lit", "SSIM, lit", "LPIPS, lit (alex)", "LPIPS, lit (vgg)", "PSNR",
+        "PSNR, lit", "SSIM, lit", "LPIPS, lit", "PSNR",
     ]  # fmt: skip
     found = rows(table)
-    assert found["buu: ctm=off"] == [21.0, 0.8, 0.2, None, 38.0]
-    assert found["buu: ctm=quick"] == [23.0, 0.8, 0.2, None, 38.0]
-    assert found["buu: the dark photographs themselves, lit"] == [25.1, None, None, None, None]
+    assert found["buu: ctm=off"] == [21.0, 0.8, 0.2, 38.0]
+    assert found["buu: ctm=quick"] == [23.0, 0.8, 0.2, 38.0]
+    assert found["buu: the dark photographs themselves, lit"] == [25.1, None, None, None]
     oracle = "buu: ctm=quick, colours fitted to the references (an oracle)"
-    assert found[oracle] == [26.0, None, None, None, None]
-    assert found["buu: Aleth-NeRF, as published"] == [20.22, 0.859, None, 0.315, None]
-    assert found["mean of LOM's five scenes: Aleth-NeRF, as published"] == [19.87, 0.754, None, 0.417, None]
+    assert found[oracle] == [26.0, None, None, None]
     ranked = {label: cells[0].rank for label, cells in table.rows if cells[0].rank}
     assert ranked == {"buu: ctm=quick": 1, "buu: ctm=off": 2}
     text = markdown(table)
-    assert "| buu: ctm=quick | **23.00** | 0.8000 | 0.2000 | - | 38.00 |" in text
-    assert "| buu: Aleth-NeRF, as published | 20.22 | 0.8590 | - | 0.3150 | - |" in text
-    assert "| buu: the dark photographs themselves, lit | 25.10 | - | - | - | - |" in text
-    assert "LPIPS is of VGG" in text
+    assert "| buu: ctm=quick | **23.00** | 0.8000 | 0.2000 | 38.00 |" in text
+    assert "| buu: the dark photographs themselves, lit | 25.10 | - | - | - |" in text
     assert "paper" not in text.lower()
-
-
-def test_vgg_stands_beside_vgg(lit):
-    table = lit_views(find_runs([lit("bike", lpips_net="vgg")]).runs)
-    assert [column.label for column in table.columns][2:] == ["LPIPS, lit", "PSNR"]
-    assert rows(table)["bike: Aleth-NeRF, as published"] == [20.46, 0.727, 0.499, None]
 
 
 def test_the_mean_is_of_settings_that_have_all_scenes(lit):
@@ -72,13 +59,8 @@ def test_the_mean_is_of_settings_that_have_all_scenes(lit):
     assert not any(label.startswith("mean of 2 scenes: ctm=off") for label in found)
 
 
-def test_a_scene_of_ones_own_has_nothing_published_beside_it(lit):
-    found = lit_views(find_runs([lit("chair", lom=False)]).runs)
-    assert "published" not in markdown(found).lower()
-
-
 def test_photographs_that_are_missing(lit):
-    folder = lit("cave", lom=False, psnr=None, psnr_lit_photo=None, converged=None)
+    folder = lit("cave", psnr=None, psnr_lit_photo=None, converged=None)
     found = rows(lit_views(find_runs([folder]).runs))
     assert found["cave: the dark photographs themselves, lit"] == [None, None, None, None]
     assert found["cave: backbone=dvgo ctm=quick"] == [22.0, 0.8, 0.2, None]
@@ -99,9 +81,9 @@ def test_lit_runs_have_one_table_and_others_theirs(lit, made, capsys):
 
 def test_appearances_have_rows_of_their_own_and_a_column(lit, capsys):
     """Scenes stand apart by how their pictures were exposed; without an appearance anywhere nothing is new."""
-    lit("room", "appearance=none", lom=False, psnr_fitted=40.0, data="a")
+    lit("room", "appearance=none", psnr_fitted=40.0, data="a")
     for appearance, fitted in (("none", 35.0), ("exposure", 39.0)):
-        folder = lit("room", f"appearance={appearance}", lom=False, psnr_fitted=fitted, data="b")
+        folder = lit("room", f"appearance={appearance}", psnr_fitted=fitted, data="b")
         put(folder / "config.yaml", "dataset.exposure", 0.5)
     assert main(["report", str(folder.parent)]) == 0
     text = capsys.readouterr().out
@@ -111,8 +93,8 @@ def test_appearances_have_rows_of_their_own_and_a_column(lit, capsys):
     assert "39.00" in text
 
 
-def test_appearances_beside_what_is_published(lit):
-    """The column of fitted views is the models' alone: neither the photographs' nor an oracle's, nor published."""
+def test_the_column_of_fitted_views_is_the_models_alone(lit):
+    """Neither the photographs' nor an oracle's."""
     folder = lit("buu", "ctm=off", "appearance=none", psnr_fitted=40.0)
     lit("buu", "ctm=off", "appearance=exposure", psnr_fitted=47.5)
     table = lit_views(find_runs([folder.parent]).runs)
@@ -121,7 +103,6 @@ def test_appearances_beside_what_is_published(lit):
     assert [label for label, mean in last.items() if mean is not None] == [
         "buu: backbone=dvgo ctm=off", "buu: appearance=exposure",
     ]  # fmt: skip
-    assert "as published" in markdown(table)
 
 
 def test_what_scenes_have_in_all_rows_leaves_the_mean(lit):
