@@ -26,18 +26,6 @@ LAYOUT_EXPECTED = {
     "rawnerf": f"a folder with {LLFF_FILE} and images or raw",
 }
 
-FOREIGN_CAPTURES = (
-    ("keyframes/cameras", b"", "Polycam's cameras", "polycam --data {root}"),
-    ("metadata.json", b"", "Record3D's cameras", "record3d --data {root}"),
-    ("EXR_RGBD/metadata.json", b"", "Record3D's cameras", "record3d --data {root}"),
-    ("*.csv", b"#", "RealityCapture's cameras", "realitycapture --data {root}/images --csv {name}"),
-    ("*.xml", b"<chunk", "Metashape's cameras", "metashape --data {root}/images --xml {name}"),
-    ("opensfm/reconstruction.json", b"", "OpenDroneMap's cameras", "odm --data {root}"),
-    ("odm_report/shots.geojson", b"", "OpenDroneMap's cameras", "odm --data {root}"),
-)
-"""Captures of other programs: a file's name, its first bytes, whose it is, and the arguments with which ns-process-data
-turns it into a transforms.json."""
-
 
 def open_layout(root: str | Path, layout: str) -> Path:
     """Open the folder of a data set of this layout."""
@@ -62,8 +50,6 @@ def way_out(root: Path) -> str:
         for path in sorted(root.glob("*.[jJ][sS][oO][nN]")):
             if meant := get_close_matches(path.name.lower(), (TRANSFORMS, TRAIN, TEST, VAL), 1, 0.8):
                 return f"did you mean {meant[0]}, which dataset=transforms reads? {path.name} lies there"
-        if theirs := foreign(root):
-            return f"{theirs}; {of_photographs(root) or f'ctm cameras finds those of photographs in {root}/images'}"
         inner = sorted(path for path in root.iterdir() if path.is_dir() and not path.name.startswith("."))
         home = root.absolute()
         for path in (*inner, *home.parents[:3]):
@@ -76,18 +62,6 @@ def way_out(root: Path) -> str:
         if any((root / f"cameras{suffix}").exists() for suffix in (".bin", ".txt")):
             return "COLMAP's files are to lie in a folder sparse there, the pictures in images"
         return of_photographs(root)
-
-
-def foreign(root: Path) -> str:
-    """Say whose cameras lie in a folder, and what turns them into a ``transforms.json``, see ``FOREIGN_CAPTURES``."""
-    for pattern, start, whose, converter in FOREIGN_CAPTURES:
-        for path in sorted(root.glob(pattern)):
-            if not start or (path.is_file() and start in path.read_bytes()[:1000]):
-                quoted = converter.format(root=shlex.quote(str(root)), name=shlex.quote(str(path)))
-                command = f"ns-process-data {quoted} --output-dir capture"
-                hints = f"{whose}, {path.relative_to(root)}, are not read"
-                return f"{hints}: {command}, of nerfstudio's, writes a {TRANSFORMS} of them"
-    return ""
 
 
 def of_photographs(root: Path) -> str:
