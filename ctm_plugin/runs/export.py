@@ -1,11 +1,10 @@
-"""A run for other programs: splats, points, a mesh, depth, cameras, lit pictures; and a page for people."""
+"""A run for other programs: splats, points, a mesh, cameras, lit pictures; and a page for people."""
 
 from __future__ import annotations
 
 import shlex
 from pathlib import Path
 
-import numpy as np
 from jaxtyping import UInt8
 from torch import Tensor
 
@@ -15,8 +14,7 @@ from ctm_plugin.color.light import Light, chosen_light
 from ctm_plugin.cpu.products import fast_products
 from ctm_plugin.data.readers.images import to_8_bits
 from ctm_plugin.errors import ConfigError
-from ctm_plugin.files import replacing, replacing_folder
-from ctm_plugin.metrics.precision import full_float32
+from ctm_plugin.files import replacing_folder
 from ctm_plugin.runs.captures import Dots, write_capture
 from ctm_plugin.runs.load import load_posed
 from ctm_plugin.runs.page import write_page
@@ -33,12 +31,12 @@ from ctm_plugin.show.pictures import write_png
 from ctm_plugin.show.ply import write_ply
 from ctm_plugin.splats.gaussians import Gaussians
 
-FOLDER_EXPORTS = ("depth", "cameras", "pictures")
+FOLDER_EXPORTS = ("cameras", "pictures")
 """Exports that are more than one file."""
 
 
 def export(run: Path, settings: ExportConfig) -> None:
-    """Write what a run found for other programs: splats, points, a mesh, depth, cameras or pictures.
+    """Write what a run found for other programs: splats, points, a mesh, cameras or pictures.
 
     Numbers are in the files' units.
 
@@ -46,7 +44,6 @@ def export(run: Path, settings: ExportConfig) -> None:
     - ``points``: where the training views' rays end, with colours and normals, as a binary PLY.
     - ``mesh``: marching cubes, with colours as seen head-on, of what the training views see up to far; of unbounded
       scenes, of the ball of cameras.
-    - ``depth``: distances along the rays of the test views.
     - ``cameras``: nerfstudio's ``transforms.json`` and COLMAP's ``sparse/0``, with the pictures that it was trained on.
     - ``pictures``: the same folder for programs that train on lit pictures: all training and test views, rendered lit,
       with masks and points. They have the size that the run was trained at: larger ones would show no more. With
@@ -78,8 +75,6 @@ def export(run: Path, settings: ExportConfig) -> None:
         check_new(sorted(path for path in there if path.is_file()))
     if what == "splats":
         write_lit(place, module, light)
-    elif what == "depth":
-        write_depths(place, module)
     elif what == "cameras":
         write_cameras(place, module.scene)
     elif what == "pictures":
@@ -130,17 +125,6 @@ def dots_of(surface: Surface, scene: Scene, light: Light) -> Dots:
     back = (scene.world or IDENTITY).inverse()
     points, normals = back.moved(surface.points.double().numpy()), surface.normals.double().numpy() @ back.turn.T
     return Dots(points, normals, to_8_bits(light.apply(surface.colors)).numpy())
-
-
-def write_depths(folder: Path, module: PosedBackbone) -> None:
-    """Write distances along the rays of the test views, ``[H, W]`` float32 as ``NAME.npy``."""
-    views, size = module.scene.test, (module.scene.world or IDENTITY).scale
-    folder.mkdir(parents=True, exist_ok=True)
-    for index, name in enumerate(views.names):
-        with full_float32(module.device):
-            distances = module.render_view(views, index, rays=1)["depth"].cpu().numpy() / size
-        with replacing(folder / f"{name}.npy") as beside, beside.open("wb") as file:
-            np.save(file, distances.astype(np.float32))
 
 
 def write_cameras(folder: Path, scene: Scene) -> None:

@@ -13,7 +13,7 @@ from ctm_plugin.settings.setting import REQUIRED, Settings, setting
 
 CAMERA_PATHS = ("capture", "orbit", "spiral", "test")
 """Names of camera paths."""
-EXPORTS = ("splats", "points", "mesh", "depth", "cameras", "pictures", "page")
+EXPORTS = ("splats", "points", "mesh", "cameras", "pictures", "page")
 """Names of what a run is exported as."""
 
 
@@ -112,7 +112,7 @@ class ExportConfig(LitConfig):
 
     what: str | None = setting(
         None,
-        "splats, points or mesh (.ply), depth (of test views), cameras (with photographs), pictures (lit) or "
+        "splats, points or mesh (.ply), cameras (with photographs), pictures (lit) or "
         "page; null: splats where there are some, else points",
         choices=EXPORTS,
     )

@@ -1,4 +1,4 @@
-"""Points, meshes, depth and cameras of runs, for other programs."""
+"""Points, meshes and cameras of runs, for other programs."""
 
 import json
 import math
@@ -25,7 +25,6 @@ from ctm_plugin.data.transforms import TransformsConfig
 from ctm_plugin.errors import CTMError
 from ctm_plugin.rays.cameras import Rays, pixel_rays
 from ctm_plugin.runs.export import write_cameras, write_surface
-from ctm_plugin.runs.load import load_posed
 from ctm_plugin.runs.surface import LAYER_THICKNESS, Surface, cloud, mesh
 from ctm_plugin.scene.views import Scene
 
@@ -213,7 +212,7 @@ def test_nerf_s_density(scenes, geometry):
     torch.testing.assert_close(density, (then - there).norm(dim=1) / (2 * step), rtol=1e-5, atol=0)
 
 
-# Cameras and depth.
+# Cameras.
 
 
 def test_cameras_load_back(hall, tmp_path):
@@ -280,15 +279,6 @@ def test_from_the_command_line(run, capsys, what):
     assert "overwrite=true" in capsys.readouterr().err
 
 
-def test_depth_from_the_command_line(run):
-    """Distances along the rays of the test views, which lie in the files' world here."""
-    assert main(["export", str(run), "what=depth"]) == 0
-    module = load_posed(run).module
-    for index, name in enumerate(module.scene.test.names):
-        expected = module.render_view(module.scene.test, index, rays=1)["depth"].detach().numpy()
-        np.testing.assert_allclose(np.load(run / f"export/depth/{name}.npy"), expected, rtol=1e-6)
-
-
 @pytest.fixture(scope="module")
 def pictured(run, tmp_path_factory) -> Path:
     out = tmp_path_factory.mktemp("pictures")
@@ -326,7 +316,7 @@ def test_lit_pictures_are_trained_on(pictured, tmp_path, layout):
     assert scores["light_factor"] == 1
 
 
-@pytest.mark.parametrize(("what", "left"), [("depth", "a.npy"), ("cameras", "images/a.png")])
+@pytest.mark.parametrize(("what", "left"), [("pictures", "images/a.png"), ("cameras", "images/a.png")])
 def test_files_of_an_export_that_was_not_finished_stay(run, tmp_path, capsys, what, left):
     file = tmp_path / what / left
     file.parent.mkdir(parents=True)
