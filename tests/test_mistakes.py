@@ -54,7 +54,6 @@ MISTAKES = [
     ("backbone.lr_gird=0.2", "voxels; did you mean backbone.lr_grid?"),
     ("ctm.wieghts.enc=1", "did you mean ctm.weights?"),
     ("ctm.weights.ecn=1", "did you mean ctm.weights.enc?"),
-    ("callbacks.film.frmaes=3", "did you mean callbacks.film.frames?"),
     ("steps=100", "trainer; did you mean backbone.steps?"),
     ("trainer.steps=100", "did you mean backbone.steps?"),
     ("ctm.p=1,2", "did you mean ctm.P?"),

@@ -105,15 +105,6 @@ def there_already(run: Path) -> CheckpointError:
     return CheckpointError(run, "a run that is there already", f"a new directory, or resume={shlex.quote(str(run))}")
 
 
-def note_colors(run: Path, description: str | None) -> None:
-    """Let ``config.yaml`` say, in a comment, what was fitted to the scene's colours; ``None``: nothing was."""
-    note = f"# fitted to the scene's colours: {description}\n"
-    # Added to, not replaced: the lock is the file's.
-    with (run / CONFIG).open("r+", encoding="utf-8") as file:
-        if description and note not in file.readlines():
-            file.write(note)
-
-
 @contextmanager
 def locked(run: Path) -> Iterator[None]:
     """Keep a run to this process. The lock goes with the process, however it ends.

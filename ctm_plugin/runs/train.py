@@ -11,7 +11,6 @@ from typing import Any
 
 import lightning as L
 import torch
-from lightning.pytorch.callbacks import LambdaCallback
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 
 from ctm_plugin.backbones.base import Backbone
@@ -42,7 +41,6 @@ from ctm_plugin.runs.rundir import (
     load_config,
     locked,
     nodes,
-    note_colors,
     save_config,
     there_already,
 )
@@ -233,10 +231,6 @@ def _trainer(config: Config, run: Path, parts: Parts, callbacks: list[L.Callback
     settings, (stopwatch, last) = parts.trainer, callbacks
     watched = bool(parts.loggers) or any(hasattr(each, "monitor") for each in parts.callbacks)
 
-    def note(trainer: L.Trainer, module: L.LightningModule) -> None:
-        if trainer.is_global_zero:
-            note_colors(run, module.transform.describe())
-
     try:
         return L.Trainer(
             accelerator=settings.backend,
@@ -257,7 +251,6 @@ def _trainer(config: Config, run: Path, parts: Parts, callbacks: list[L.Callback
                 stopwatch,
                 *([] if settings.minutes is None else [Deadline(60 * settings.minutes, stopwatch), Preview()]),
                 RunInfo(config),
-                LambdaCallback(on_train_start=note),
                 FiniteLoss(run / LAST),
                 *parts.callbacks,
                 last,

@@ -265,22 +265,6 @@ def test_eight_runs_some_impossible_and_killed_halfway(ball, tmp_path, capsys):
     assert row["runs"] == "4"
 
 
-def test_a_search_of_ctms_weights(recorded, monkeypatch):
-    """Optuna's trials are runs whose weights lie in the ranges; the best one is written down."""
-    command = ["-m", "ctm=quick", "hydra/sweeper=search_weights", "hydra.sweeper.n_trials=3", "hydra.sweep.dir=s"]
-    assert main(command) == 0
-    weights = [config["ctm"]["weights"] for config in recorded]
-    assert len({tuple(each.values()) for each in weights}) == 3
-    for each in weights:
-        assert 100 <= each["img"] <= 100_000
-        assert 1 <= each["rand"] <= 1000
-        assert 1 <= each["latent"] <= 10_000
-        assert (each["enc"], each["dec"]) == (1.5, 1.5)
-    best = yaml.safe_load(Path("s/optimization_results.yaml").read_text())
-    assert best["best_value"] == 23.0
-    assert best["best_params"]["ctm.weights.img"] == weights[-1]["img"]
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "arguments", [["seed=0,1"], ["seed=0,1", "backbone.lr_grid=1e30"]], ids=["finished", "diverged"]

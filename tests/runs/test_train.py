@@ -29,7 +29,7 @@ from ctm_plugin.runs.compose import conf_dir
 from ctm_plugin.runs.data import DATA_FILE
 from ctm_plugin.runs.evaluate import evaluate
 from ctm_plugin.runs.provenance import code_version, versions
-from ctm_plugin.runs.rundir import CONFIG, LAST, METRICS, note_colors
+from ctm_plugin.runs.rundir import CONFIG, LAST, METRICS
 from ctm_plugin.runs.settings import TrainerConfig
 from ctm_plugin.runs.train import resume, train, warn_of_short_run
 from ctm_plugin.scene.views import composite
@@ -71,13 +71,6 @@ def test_files(run):
 def test_config_holds_all_that_was_resolved(run, config):
     assert yaml.safe_load((run / CONFIG).read_text()) == {"version": __version__, **config}
     assert "${" not in (run / CONFIG).read_text()
-
-
-def test_config_says_once_what_was_found_in_the_colours(tmp_path):
-    (tmp_path / CONFIG).write_text("seed: 0\n")
-    for found in ("gain 3", "gain 3", None):
-        note_colors(tmp_path, found)
-    assert (tmp_path / CONFIG).read_text() == "seed: 0\n# fitted to the scene's colours: gain 3\n"
 
 
 def test_every_figure(run):
