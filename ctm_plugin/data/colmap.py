@@ -30,8 +30,8 @@ class ColmapConfig(Layout, ColmapSettings):
         several models, that in ``sparse/0`` is taken, with a warning. Cameras are ``SIMPLE_PINHOLE``, ``PINHOLE``,
         ``SIMPLE_RADIAL``, ``RADIAL``, ``OPENCV``, or ``FULL_OPENCV`` without k4 to k6; others are refused.
 
-        Rays are undistorted, pictures stay as they are. A picture has its camera's size, or the same at another scale;
-        ``crop`` says how others were cut. Masks lie in a folder ``masks`` next to ``images``.
+        Rays are undistorted, pictures stay as they are. A picture has its camera's size, or the same at another scale.
+        Masks lie in a folder ``masks`` next to ``images``.
 
         Pictures that are registered but missing are left out, with one warning.
         """

@@ -168,22 +168,7 @@ class CaptureConfig(BoundsConfig):
         "the test views",
         least=2,
     )
-    crop: tuple[int, ...] | None = setting(
-        None,
-        "[left, top] pixels that were cut off pictures smaller than their camera's size; []: they were scaled; "
-        "null: unknown, which is refused",
-    )
     background: str = "black"
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.crop is not None and (len(self.crop) not in (0, 2) or min(self.crop, default=0) < 0):
-            raise self.fault("crop", "[], null or two integers >= 0, [left, top]")
-
-    @property
-    def whole_factor(self) -> int:
-        """As others', but pixels that were cut off count in the pictures as they were taken."""
-        return 1 if self.crop else super().whole_factor
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -28,10 +28,7 @@ def develop_photographs(capture: Capture, config: BoundsConfig) -> tuple[Views, 
     source, photographs = capture.source, upright(capture.photographs, capture.source)
     headers = headers_of(photographs)
     photo = replace(config, downscale=1) if capture.shrunk else config
-    crop = getattr(config, "crop", None)
-    cameras = [
-        camera_of(photograph, header, source, crop) for photograph, header in zip(photographs, headers, strict=True)
-    ]
+    cameras = [camera_of(photograph, header, source) for photograph, header in zip(photographs, headers, strict=True)]
     photo, sizes, canvas = on_one_canvas(headers, photo, source)
     for camera in dict.fromkeys(cameras):
         if camera.distortion != PINHOLE:
@@ -120,7 +117,7 @@ def on_one_canvas(
     return config, sizes, (max(height for height, _ in sizes), max(width for _, width in sizes))
 
 
-def camera_of(photograph: Photograph, header: Header, source: Path, crop: tuple[int, ...] | None) -> Intrinsics:
+def camera_of(photograph: Photograph, header: Header, source: Path) -> Intrinsics:
     """Intrinsics of a photograph, upright, see :meth:`~ctm_plugin.data.readers.lens.Intrinsics.of_picture`."""
     path, camera, (height, width, *_) = photograph.path, photograph.camera, header
     turned = photograph.shown or (header.orientation > 4 and (width - height) * (camera.width - camera.height) > 0)
@@ -129,7 +126,7 @@ def camera_of(photograph: Photograph, header: Header, source: Path, crop: tuple[
         said = f"{camera.width:g}x{camera.height:g}, as {camera.where} of {source.name}"
         expected = f"{said}, beyond doubt: take the tag off, or find the cameras anew by ctm cameras"
         raise DataError(path, found, expected)
-    return camera.of_picture(width, height, path, source, crop)
+    return camera.of_picture(width, height, path, source)
 
 
 def exposures_told(headers: Sequence[Header]) -> Float32[Tensor, " n"] | None:

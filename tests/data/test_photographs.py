@@ -17,9 +17,7 @@ from scipy.optimize import brentq
 from ctm_plugin.data.colmap import ColmapConfig
 from ctm_plugin.data.readers.colmap_model import mark_as_shown, searched_in
 from ctm_plugin.data.readers.lens import Intrinsics
-from ctm_plugin.data.settings import CaptureConfig
-from ctm_plugin.errors import ConfigError, DataError
-from ctm_plugin.settings.build import build
+from ctm_plugin.errors import DataError
 
 WIDTH, HEIGHT = YARD_SIZE
 PINHOLE = (1, (20.0, 20.0, 6.0, 8.0))
@@ -51,37 +49,9 @@ def test_the_same_picture_at_another_scale(size):
 def test_pictures_of_another_size_are_refused(size):
     """496x372 has the ratio of 500x375, but may as well be cut."""
     found = f"a.png: found a picture of {size[0]}x{size[1]}, expected 500x375 as camera 1 of cameras.bin: "
-    with pytest.raises(DataError, match=r"dataset\.crop=\[LEFT,TOP\] if it was cut") as caught:
+    with pytest.raises(DataError, match="the picture that the camera is of") as caught:
         CAMERA.of_picture(*size, PATH, SOURCE)
     assert str(caught.value).startswith(found)
-
-
-def test_declared():
-    cut = CAMERA.of_picture(496, 372, PATH, SOURCE, (3, 1))
-    assert cut.pinhole == (735.4, 735.0, 248.0, 185.0)
-    scaled = CAMERA.of_picture(496, 372, PATH, SOURCE, ())
-    assert scaled.fx == pytest.approx(735.4 * 496 / 500)
-    with pytest.raises(DataError, match=r"one that lies within 500x375 .* with dataset\.crop=\[5,0\]"):
-        CAMERA.of_picture(496, 372, PATH, SOURCE, (5, 0))
-    with pytest.raises(DataError, match="found a picture of 400x375, expected 500x375"):
-        CAMERA.of_picture(400, 375, PATH, SOURCE, ())
-
-
-@pytest.mark.parametrize("crop", [[1], [1, 2, 3], [-1, 0]])
-def test_cuts_that_cannot_be(crop):
-    with pytest.raises(ConfigError, match=r"dataset\.crop: found .*, expected \[\], null or two integers >= 0"):
-        build(CaptureConfig, {"root": "somewhere", "crop": crop}, "dataset")
-
-
-def test_cut_pictures_of_a_scene(yard):
-    whole = load(yard).train
-    fill(yard / "images", (20, 14))
-    with pytest.raises(DataError, match=r"f_00\.png: found a picture of 20x14, expected 24x16 as camera 1"):
-        load(yard)
-    cut = load(yard, crop=(3, 1)).train
-    moved = torch.tensor([0.0, 0.0, 3.0, 1.0])
-    torch.testing.assert_close(cut.intrinsics, whole.intrinsics - moved)
-    torch.testing.assert_close(load(yard, crop=(3, 1), downscale=2).train.intrinsics, (whole.intrinsics - moved) / 2)
 
 
 def test_a_folder_with_some_of_the_pictures_is_not_preferred(yard):

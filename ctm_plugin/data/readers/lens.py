@@ -76,27 +76,21 @@ class Intrinsics(NamedTuple):
             width=width, height=height, fx=self.fx * across, fy=self.fy * down, cx=self.cx * across, cy=self.cy * down
         )
 
-    def of_picture(
-        self, width: int, height: int, path: Path, source: Path, crop: tuple[int, ...] | None = None
-    ) -> Intrinsics:
+    def of_picture(self, width: int, height: int, path: Path, source: Path) -> Intrinsics:
         """The camera of a picture that may be of another size than ``source`` says.
 
-        The same picture at another scale is recognised by its ratio; at nearly the same scale it may be cut
-        instead, of which ``crop`` tells: (left, top) pixels cut off; empty: none were; ``None``: nobody says.
+        The same picture at another scale is recognised by its ratio; at nearly the same scale it may be cut, and is
+        refused.
         """
         found = f"a picture of {width}x{height}"
-        frame = f"{self.width:g}x{self.height:g} as {self.where} of {source.name}"
-        if crop:
-            left, top = crop
-            if left + width > self.width or top + height > self.height:
-                raise DataError(path, found, f"one that lies within {frame} with dataset.crop=[{left},{top}]")
-            return self._replace(width=width, height=height, cx=self.cx - left, cy=self.cy - top)
         if (width, height) == (self.width, self.height):
             return self
         ratio = width / self.width
         off = abs(self.height * ratio - height)
         alike = min(off, off / self.height * self.width) <= 1
-        if alike and (crop is not None or not CROP_RATIOS[0] < ratio < CROP_RATIOS[1]):
+        if alike and not CROP_RATIOS[0] < ratio < CROP_RATIOS[1]:
             return self.scaled(width, height)
-        either = "dataset.crop=[] if it was scaled, " if alike else "the same at another scale, or "
-        raise DataError(path, found, f"{frame}: {either}dataset.crop=[LEFT,TOP] if it was cut, of pixels cut off there")
+        frame = f"{self.width:g}x{self.height:g} as {self.where} of {source.name}"
+        raise DataError(
+            path, found, f"{frame}: the picture that the camera is of, or the same at half its size or less"
+        )
