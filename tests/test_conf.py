@@ -213,15 +213,6 @@ def test_what_ctm_needs_is_of_backbones_that_exist(composed, name):
         assert found[name] != without[name][name]
 
 
-def test_values_of_the_paper_for_nerf(composed):
-    nerf = composed("backbone=nerf", "trainer=paper")["backbone"]
-    assert (nerf["width"], nerf["depth"], nerf["skip"]) == (256, 8, 5)
-    assert (nerf["coarse_samples"], nerf["fine_samples"], nerf["rays"], nerf["steps"]) == (64, 128, 1024, 100_000)
-    for geometry, those in {"bounded": (5e-4, 500_000, 500, 0), "forward": (5e-4, 250_000, 0, 1)}.items():
-        nerf = composed("backbone=nerf", "trainer=paper", f"backbone.geometry={geometry}")["backbone"]
-        assert (nerf["lr"], nerf["lr_decay_steps"], nerf["crop_steps"], nerf["density_noise"]) == those
-
-
 PAPER = {
     "synthetic_nerf": ("blender", {"nerf": "white", "dvgo": "white"}),
     "synthetic_nerf_dark": ("blender", {"nerf": "random", "dvgo": "random"}),

@@ -32,7 +32,7 @@ KINDS = {
 
 def made(run: Path, out: str) -> dict[str, bytes]:
     """What render and export write, but for pictures of the data."""
-    kinds = ("points", "cameras", "pictures", "depth", *(("splats",) if "splat" in run.name else ("mesh",)))
+    kinds = ("points", "cameras", "pictures", *(("splats",) if "splat" in run.name else ("mesh",)))
     for what in kinds:
         settings = (f"what={what}", f"out={run / out}", "points=500", "cells=8", "opaque=0.0003")
         assert main(["export", str(run), *settings]) == 0
