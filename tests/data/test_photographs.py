@@ -49,7 +49,7 @@ def test_the_same_picture_at_another_scale(size):
 def test_pictures_of_another_size_are_refused(size):
     """496x372 has the ratio of 500x375, but may as well be cut."""
     found = f"a.png: found a picture of {size[0]}x{size[1]}, expected 500x375 as camera 1 of cameras.bin: "
-    with pytest.raises(DataError, match="the picture that the camera is of") as caught:
+    with pytest.raises(DataError, match="the picture that it is of") as caught:
         CAMERA.of_picture(*size, PATH, SOURCE)
     assert str(caught.value).startswith(found)
 

@@ -1,6 +1,5 @@
 """The verbs: help, one grammar for all, and every mistake as one message."""
 
-import runpy
 import subprocess
 import sys
 from importlib.metadata import EntryPoints
@@ -145,14 +144,6 @@ def test_the_demo_tells_a_bad_key_before_it_trains(monkeypatch, capsys):
     assert cli.main(["demo", "ctm.pretrain_steps=100"]) == 1
     told = "ctm.pretrain_steps: found an unknown key, expected one of name, preset"
     assert capsys.readouterr().err == f"error: {told}\n"
-
-
-@pytest.mark.parametrize("name", ["evaluate", "render", "report", "view"])
-@pytest.mark.filterwarnings("ignore:.*found in sys.modules")
-def test_old_spellings_fail_plainly(name):
-    """``python -m ctm_plugin.NAME``: there is none, or it says what it is now."""
-    with pytest.raises((ImportError, SystemExit), match=name):
-        runpy.run_module(f"ctm_plugin.{name}", run_name="__main__")
 
 
 def test_verbs_are_listed_without_torch():

@@ -91,6 +91,6 @@ class Intrinsics(NamedTuple):
         if alike and not CROP_RATIOS[0] < ratio < CROP_RATIOS[1]:
             return self.scaled(width, height)
         frame = f"{self.width:g}x{self.height:g} as {self.where} of {source.name}"
-        raise DataError(
-            path, found, f"{frame}: the picture that the camera is of, or the same at half its size or less"
-        )
+        smaller, larger = CROP_RATIOS
+        expected = f"{frame}: the picture that it is of, or the same at a scale below {smaller} or above {larger}"
+        raise DataError(path, found, expected)
