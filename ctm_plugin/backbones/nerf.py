@@ -114,11 +114,6 @@ class NeRF(RadianceBackbone):
             ) + transmittance * self.scene.far
         return RayRendering((coarse, fine), opacity=1 - transmittance.detach(), depth=depth)
 
-    def query(self, points: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
-        local, unit = self.space.place(points)
-        density, latent = self.fine(local[:, None], directions)
-        return density.squeeze(1) * unit, latent.squeeze(1)
-
     def _spread(self, s: Tensor) -> Tensor:
         """Map [0, 1] onto the rays: ``[R, S]`` to distances, or to NDC's own parameter."""
         near, far = self.space.near, self.space.far
