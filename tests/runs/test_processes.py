@@ -94,7 +94,7 @@ def test_a_sweep_of_two_processes_a_job(arguments, tmp_path):
 @pytest.mark.slow
 def test_two_processes_end_on_time_alike(arguments, tmp_path):
     """The first one's clock cuts or stretches the schedule of both: to what 3 seconds allow, a quarter at least."""
-    splats = ("backbone=splat", "ctm=off", "trainer.image_every=null", "backbone.steps=400", "backbone.views=2")
+    splats = ("backbone=splat", "ctm=off", "trainer.image_every=null", "backbone.steps=100", "backbone.views=2")
     splats += ("trainer.minutes=0.05",)
     command = [*TORCHRUN, ddp_rank.__file__, str(tmp_path), *arguments, *splats, "trainer.accelerator=cpu", *TWO]
     command += [f"hydra.run.dir={tmp_path / 'run'}"]
@@ -102,7 +102,8 @@ def test_two_processes_end_on_time_alike(arguments, tmp_path):
     assert both.returncode == 0, both.stderr
     first, second = (torch.load(tmp_path / f"rank{rank}.pt", weights_only=True) for rank in (0, 1))
     saved = torch.load(tmp_path / "run" / LAST, weights_only=True)
-    assert saved["turns"][-1][2] == saved["global_step"] != 400
+    assert len(saved["turns"]) > 1
+    assert saved["turns"][-1][2] == saved["global_step"]
     assert first["batches"] == second["batches"] == saved["batches_seen"]
     assert list(differing(first["weights"], second["weights"])) == []
 
