@@ -9,8 +9,8 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from mutations import Payload
 from scipy.spatial.transform import Rotation
+from strangers import Payload
 
 from ctm_plugin.cli import main as train
 from ctm_plugin.color.light import Light
