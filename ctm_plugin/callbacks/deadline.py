@@ -36,7 +36,7 @@ class Deadline(L.Callback):
 
     @property
     def left(self) -> float:
-        """Seconds of training that are left."""
+        """Seconds that the training still has."""
         return max(self.seconds - self.stopwatch.seconds, 0.0)
 
     def on_train_start(self, trainer: L.Trainer, pl_module: Backbone) -> None:

@@ -81,7 +81,7 @@ class Capture:
 
     @property
     def views(self) -> tuple[str, ...]:
-        """A unique name for each view, see :func:`~ctm_plugin.data.readers.folders.view_names`."""
+        """A unique name for each photograph, see :func:`~ctm_plugin.data.readers.folders.view_names`."""
         splits = (~self.testing, self.testing) if self.synthetic else (np.ones_like(self.testing),)
         paths = [[self.photographs[i].path for i in np.flatnonzero(split)] for split in splits]
         return tuple(name for split in paths for name in view_names(split))

@@ -29,7 +29,7 @@ def called(do: Callable[[], Awaitable[None] | None]) -> Callable[[object], Await
 
 
 def camera_of(client: viser.ClientHandle) -> BrowserCamera | None:
-    """A client's camera, ``None`` while it has none."""
+    """The present camera of a browser client; ``None`` before the client has sent one."""
     at = client.camera
     camera = BrowserCamera(tuple(at.wxyz), tuple(at.position), at.fov, at.aspect)
     return camera if camera.usable() else None
