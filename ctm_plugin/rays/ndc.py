@@ -31,7 +31,7 @@ class NDC(NamedTuple):
     near: float
 
     def rays(self, rays: Rays) -> Rays:
-        """Give the same lines in NDC: ``t`` = 0 on the near plane, 1 at infinity. Directions are not of unit length.
+        """Transform rays into NDC: ``t`` = 0 on the near plane, 1 at infinity. Directions are not of unit length.
 
         Args:
             rays: R rays in the world, directions with z < 0.

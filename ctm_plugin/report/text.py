@@ -22,11 +22,11 @@ PAIRED = (
 RANK_MARKS = {"md": ("**{}**", "_{}_"), "html": ("{} ●", "{} ○")}
 """Templates that mark the best and the second best of a column by format."""
 RANK_LEGENDS = {"md": ("**Best**", "_second best_"), "html": ("● best", "○ second best")}
-"""Words that explain these marks by format."""
+"""Legends that explain the marks of ranks by format."""
 
 
 class Written(NamedTuple):
-    """A table as text: grids, a list of lines with the headings first, and what stands above and below them."""
+    """A table as text: its grids, each a list of lines with the headings first, and the text above and below."""
 
     title: str
     above: list[str]
@@ -37,12 +37,12 @@ class Written(NamedTuple):
 
 
 def spread(mean: float, std: float | None, decimals: int, sign: str = "") -> str:
-    """``mean ± std``, or ``mean`` of one."""
+    """Format ``mean ± std``, or only the mean where there is no deviation."""
     return f"{mean:{sign}.{decimals}f}" + ("" if std is None else f" ± {std:.{decimals}f}")
 
 
 def written(table: Table, form: str) -> Written:
-    """A table as text for a format of :data:`RANK_MARKS`."""
+    """Write a table's cells as text for a format of :data:`RANK_MARKS`."""
     lines = [_headings(table), *(_line(table, *row, ("{}", *RANK_MARKS[form])) for row in table.rows)]
     about = ABOUT.format(*RANK_LEGENDS[form]) + (PAPERS.format(data=table.data) if table.data else "")
     below = [NOT_CONVERGED] if any("N.C." in cell for line in lines[1:] for cell in line) else []
@@ -72,7 +72,7 @@ def _line(table: Table, label: str, cells: Sequence[Cell], marks: Sequence[str])
 
 
 def _ours(cell: Cell, decimals: int) -> str:
-    """``mean ± std (seeds)``, with what did not converge."""
+    """Format a cell as ``mean ± std (seeds)``, with the number of runs that did not converge."""
     if cell.mean is None:
         return "N.C." if cell.not_converged else "-"
     text = spread(cell.mean, cell.std, decimals)
@@ -82,7 +82,7 @@ def _ours(cell: Cell, decimals: int) -> str:
 
 
 def _differences(table: Table) -> list[list[str]]:
-    """Headings, and a line for each two rows with their paired differences; empty where there is none."""
+    """Grid of paired differences: headings, and a line for each two rows compared; empty where there are none."""
     texts_by_row: dict[str, dict[Column, str]] = {}
     for label, cells in table.rows:
         for cell, column in zip(cells, table.columns, strict=True):
@@ -95,7 +95,7 @@ def _differences(table: Table) -> list[list[str]]:
 
 
 def _paired(difference: Difference, decimals: int) -> str:
-    """``mean ± half (pairs)``, and what it says."""
+    """Format a difference as ``mean ± half (pairs)``, with a word on whether it is an improvement."""
     pairs = "" if difference.half is None else f" ({difference.pairs})"
     verdict = {True: " better", False: " worse", None: ""}[difference.better]
     return spread(difference.mean, difference.half, decimals, "+") + pairs + verdict
@@ -117,8 +117,8 @@ def markdown(table: Table) -> str:
 
 
 def csv_text(tables: Sequence[Table]) -> str:
-    """One line a row and column, or as many as the row is compared with others; numbers unrounded; empty where there is
-    none, ``N.C.`` where nothing converged.
+    """Tables as CSV: a line for each row, column and comparison; numbers unrounded; empty where there is none,
+    ``N.C.`` where nothing converged.
     """
     out = io.StringIO()
     scores = ("mean", "std", "seeds", "scenes", "runs", "not_converged", "paper", "difference")
@@ -141,4 +141,4 @@ FORMATS = {
     "md": lambda tables: "\n".join(map(markdown, tables)),
     "csv": csv_text,
 }
-"""Function that writes tables as text by format."""
+"""Functions that write tables as text, by format."""

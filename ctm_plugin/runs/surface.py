@@ -33,7 +33,7 @@ class Surface(NamedTuple):
 
 
 def spanned(points: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:
-    """Normals of the surface between a picture's neighbouring points, either way round; 0 of those without any."""
+    """Normals, of either sign, of the surface through a picture's neighbouring points; 0 without neighbours."""
     around = F.pad(points.permute(2, 0, 1)[None], (1, 1, 1, 1), mode="replicate")[0]
     across, down = around[:, 1:-1, 2:] - around[:, 1:-1, :-2], around[:, 2:, 1:-1] - around[:, :-2, 1:-1]
     return F.normalize(torch.linalg.cross(across, down, dim=0), dim=0).permute(1, 2, 0)
@@ -41,15 +41,17 @@ def spanned(points: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:
 
 @torch.no_grad()
 def cloud(module: PosedBackbone, max_points: int, opaque: float) -> Surface:
-    """End points of the training views' rays, in the colours that they have there; normals are of neighbouring ends.
+    """Cloud of the points where the training views' rays end, with the colours rendered there.
+
+    Normals are those of the surface through neighbouring end points.
 
     Args:
-        module: with its weights.
-        most: points, over all views, which are thinned evenly.
+        module: the backbone with trained weights.
+        max_points: most points over all views, which are thinned evenly.
         opaque: share of a ray's light that matter must stop.
 
     Raises:
-        CTMError: nothing does.
+        CTMError: no ray meets such matter.
     """
     scene, views = module.scene, module.scene.train
     every = max(1, math.ceil(math.sqrt(len(views) * views.height * views.width / max_points)))

@@ -24,9 +24,9 @@ def write_ply(
     """Write vertices with normals and colours, whole or not at all.
 
     Args:
-        path: of the file.
+        path: the file to write.
         points, normals: in any unit; normals of unit length.
-        colors: sRGB.
+        colors: sRGB of the vertices.
     """
     vertices = np.empty(len(points), VERTEX_TYPE)
     for names, values in ((("x", "y", "z"), points), (("nx", "ny", "nz"), normals), (("red", "green", "blue"), colors)):

@@ -1,4 +1,4 @@
-"""The server: the page of each client, and the painter behind all of them."""
+"""The viewer's web server: a page for each browser client, and one painter for all."""
 
 from __future__ import annotations
 
@@ -39,11 +39,11 @@ class Viewer:
     """A web server for one run, or several of the same scene.
 
     Args:
-        subjects: at least one.
+        subjects: the runs to serve, at least one.
         settings: the port, and in which light to begin.
 
     Attributes:
-        address: of the page.
+        address: URL of the page.
 
     Raises:
         ConfigError: nothing can listen there.
@@ -130,7 +130,7 @@ def check_free(port: int) -> None:
     """Refuse a port that nothing can listen at; viser would take another.
 
     Raises:
-        ConfigError: so it is.
+        ConfigError: the port is in use or cannot be used.
     """
     try:
         socket.create_server((HOST, port)).close()
@@ -151,10 +151,10 @@ def admitted(headers: Mapping[str, str]) -> bool:
 
 @contextmanager
 def guarded() -> Iterator[None]:
-    """A server that viser starts inside answers what is :func:`admitted`, and sends ``CONTENT_POLICY`` with its pages.
+    """Context in which a server of viser answers only :func:`admitted` requests, and sends ``CONTENT_POLICY``.
 
-    By itself it lets pages of other sites connect, also where the site's name was made to mean this machine (DNS
-    rebinding), and its page loads a script for statistics from elsewhere.
+    By itself viser lets pages of other sites connect, also by DNS rebinding. Its page loads a script for statistics
+    from another host.
     """
     serve = server.serve
 

@@ -1,4 +1,4 @@
-"""Layouts of a folder's files: each loader opens its folder here. An error names the one that fits."""
+"""Layouts of a data set's folder, recognised by its files. Errors name the layout that fits."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ LAYOUT_EXPECTED = {
 
 
 def open_layout(root: str | Path, layout: str) -> Path:
-    """Open the folder of a data set of this layout."""
+    """Find the folder of a data set, or refuse one without files of ``layout``."""
     with suppress(OSError, ValueError, RuntimeError):  # what cannot be a path is refused below
         path = Path(root).expanduser()
         if path.is_file() and layouts(path.parent):
@@ -44,7 +44,7 @@ def open_layout(root: str | Path, layout: str) -> Path:
 
 
 def way_out(root: Path) -> str:
-    """Say what to do with a folder without files of any layout: which folder near it has some, or where to get them."""
+    """Word the hint for a folder without files of any layout: a folder near it that has some, or how to make them."""
     quoted = shlex.quote(str(root))
     with told(root, "a folder that cannot be read", "the folder of a data set"):
         for path in sorted(root.glob("*.[jJ][sS][oO][nN]")):
@@ -65,7 +65,7 @@ def way_out(root: Path) -> str:
 
 
 def of_photographs(root: Path) -> str:
-    """Say how to find the cameras of the photographs in a folder; empty where there are none."""
+    """Word the hint how to find the cameras of a folder's photographs; empty where there are no photographs."""
     quoted = shlex.quote(str(root))
     if any(map(is_picture, root.iterdir())):
         return f"ctm cameras {quoted} finds those of the photographs, for dataset=colmap"
@@ -99,11 +99,11 @@ def layouts(root: Path) -> list[str]:
 
 
 def model_folder(root: Path) -> Path | None:
-    """Find where COLMAP's model lies, binary or text; ``None``: nowhere."""
+    """Find the folder of COLMAP's model, binary or text; ``None``: there is none."""
     return next(iter(model_folders(root)), None)
 
 
 def model_folders(root: Path) -> list[Path]:
-    """List where COLMAP's models lie, the one that is taken first."""
+    """List the folders of COLMAP's models, first the one that is read."""
     folders = dict.fromkeys([*(root / name for name in MODEL_FOLDERS), *sorted(root.glob("*sparse/[0-9]*"))])
     return [each for each in folders if any((each / f"cameras.{kind}").exists() for kind in ("bin", "txt"))]
