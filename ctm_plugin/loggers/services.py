@@ -1,4 +1,4 @@
-"""Lightning's loggers of CSV, TensorBoard, Weights & Biases and MLflow, made to resume in a run's folder."""
+"""Lightning's loggers of TensorBoard and Weights & Biases, made to resume in a run's folder."""
 
 from __future__ import annotations
 
