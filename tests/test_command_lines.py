@@ -209,7 +209,7 @@ def test_choice(group, choice, begun, composed):
 LINES = [
     "", "dataset=blender dataset.root=FOLDER", "train FOLDER dataset=blender", "-m seed=0,1 ctm=off,auto",
     "resume=RUN_DIR", "resume=RUN_DIR dataset.root=FOLDER", "resume RUN_DIR", "evaluate RUN_DIR light=off",
-    "render RUN_DIR path=orbit", "export RUN_DIR what=points", "view RUN_DIR RUN_DIR", "report RUNS RUNS format=md",
+    "render RUN_DIR path=orbit", "export RUN_DIR what=mesh", "view RUN_DIR RUN_DIR", "report RUNS RUNS format=md",
     "list", "list backbone ctm=on", "demo backbone.coarse=false", "cameras FOLDER", "photos FOLDER ctm=off",
     "scenes a.blend out=b", "--help", "--version", "--cfg job ctm=off", "backbone.rays=9 ++seed=3 +loss=l1",
 ]  # fmt: skip

@@ -165,7 +165,7 @@ def test_typos_and_help_are_told_before_torch_is_imported(tmp_path):
         "backbone.lr_gird=1": "backbone.lr_grid",
         "dataset=stil_life": "still_life",
         "rendr RUN": "render",
-        "export RUN wat=points": "what",
+        "export RUN wat=mesh": "what",
         "list bakbone": "backbone",
         "demo backbone.lr_gird=1": "backbone.lr_grid",
     }

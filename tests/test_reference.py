@@ -89,6 +89,7 @@ def test_the_page_of_verbs(reference):
     assert "| `frames` | `120` | " in page
     assert "| `out` | needed | " in page
     assert "| `lit/`, `photo/` | each test view" in page
+    assert "- `mesh`: marching cubes" in page
     assert "Raises:" not in page
 
 

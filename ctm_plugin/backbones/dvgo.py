@@ -119,6 +119,9 @@ class DVGO(OccupiedBackbone):
     def settled(self) -> int:
         return self.fine_start + max(self.config.grow, default=0)
 
+    def world_box(self) -> Tensor:
+        return self.field.grid.aabb if self.geometry == "bounded" else super().world_box()
+
     # Training.
 
     @property

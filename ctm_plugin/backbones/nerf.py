@@ -114,6 +114,11 @@ class NeRF(RadianceBackbone):
             ) + transmittance * self.scene.far
         return RayRendering((coarse, fine), opacity=1 - transmittance.detach(), depth=depth)
 
+    def query(self, points: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
+        local, unit = self.space.place(points)
+        density, latent = self.fine(local[:, None], directions)
+        return density.squeeze(1) * unit, latent.squeeze(1)
+
     def _spread(self, s: Tensor) -> Tensor:
         """Map shares ``[R, S]`` of the way from near to far to distances along rays, or to NDC's ray parameter."""
         near, far = self.space.near, self.space.far

@@ -124,3 +124,6 @@ class NGP(OccupiedBackbone):
         """Draw training pixels from the rays that may meet an occupied cell, once cells are permanently free."""
         if self.settles and not self.field.met.all():
             self.draw_those(self.field.hits)
+
+    def world_box(self) -> Tensor:
+        return self.pictured_field.around if self.config.geometry == "bounded" else super().world_box()

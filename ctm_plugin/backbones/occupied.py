@@ -125,6 +125,15 @@ class OccupiedField(nn.Module):
         rendered = light + transmittance[:, None] * background
         return rendered, depth, Samples(latent, weights, t, ray_index, transmittance)
 
+    def query(self, points: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
+        """Density ``[M]`` and latent ``[M, k]`` at points of the world, see :meth:`PosedBackbone.query`."""
+        local, unit = self.space.place(points)
+        low, high = self.space.aabb
+        there = ((local >= low) & (local <= high)).all(1) & self.occupancy[self.grid.nearest(local)]
+        density, shade = self.evaluate(torch.minimum(torch.maximum(local, low), high))
+        every = torch.arange(len(points), device=points.device)
+        return density * unit * there, shade(every, directions, every)
+
     @torch.no_grad()
     def hits(self, rays: Rays) -> Tensor:
         """``[R]`` boolean: whether a ray of the world may meet an occupied cell; errs to True."""
@@ -177,6 +186,9 @@ class OccupiedBackbone(Averaging, RadianceBackbone):
         offset = 0.5 if draws is None else draws.uniform(len(rays.origins), 1).squeeze(1)
         latent, depth, samples = self.pictured_field(rays, background, offset)
         return OccupiedRendering((latent,), opacity=1 - samples.transmittance.detach(), depth=depth, samples=samples)
+
+    def query(self, points: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
+        return self.pictured_field.query(points, directions)
 
     def regularisers(self, batch: RayBatch, rendering: OccupiedRendering, target: Tensor) -> dict[str, Tensor]:
         """Distortion of the weights along a ray, and their nearness to its camera, in shares of the way from near to

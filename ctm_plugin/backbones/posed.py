@@ -21,10 +21,12 @@ from ctm_plugin.color.photometric import Photometric
 from ctm_plugin.color.prepare import SAMPLE_COLORS
 from ctm_plugin.color.transform import ColorTransform, Uniform
 from ctm_plugin.draws import Draws
+from ctm_plugin.errors import CTMError
 from ctm_plugin.metrics.detail import detail_moments
 from ctm_plugin.metrics.evaluate import Scoring, summarize
 from ctm_plugin.metrics.precision import full_float32
 from ctm_plugin.rays.cameras import Rays, pixel_rays
+from ctm_plugin.scene.frustum import camera_ball, frustum_box
 from ctm_plugin.scene.kinds import GEOMETRIES
 from ctm_plugin.scene.views import Scene, Views, composite, unit
 from ctm_plugin.show.pictures import depth_picture, latent_picture, write_png
@@ -94,6 +96,30 @@ class PosedBackbone(Backbone):
             raise ValueError(f"a loss of {scale} times its weight")
         self.photometric = replace(self.photometric, weight=self.photometric.weight * (scale / self.loss_scale))
         self.loss_scale = scale
+
+    def query(self, points: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
+        """Density and colour at points, for programs that take a field elsewhere.
+
+        Args:
+            points: ``[M, 3]`` of the scene's world.
+            directions: ``[M, 3]``, unit length, along which each is looked at.
+
+        Returns:
+            Density ``[M]``, optical depth a unit of length (in NDC of depth), 0 where nothing is; and latents
+            ``[M, k]``, not defined where it is 0.
+
+        Raises:
+            CTMError: the backbone does not tell.
+        """
+        raise CTMError(f"{type(self).__name__} has no method query, which gives densities at points")
+
+    def world_box(self) -> Float[Tensor, "2 3"]:
+        """What a mesh is made of: all that training views see up to far; of unbounded scenes the ball of cameras."""
+        scene = self.scene
+        if scene.geometry != "unbounded":
+            return frustum_box(scene.train, scene.near, scene.far)
+        centre, radius = camera_ball(scene.train, scene.near)
+        return torch.stack([centre - radius, centre + radius])
 
     def place(self, pixel: Tensor, rendered: Tensor) -> PixelPlaces:
         """Positions of training pixels ``[R]`` on their pictures, with the colours rendered there, ``[R, 3]`` sRGB."""

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from ctm_plugin.rays.cameras import Rays
-from ctm_plugin.rays.contraction import BALL_RADIUS, END_PACE, lengths, paced, travelled
+from ctm_plugin.rays.contraction import BALL_RADIUS, END_PACE, contract, distance, lengths, paced, travelled
 from ctm_plugin.rays.grid import Shape, voxel_size
 from ctm_plugin.rays.ndc import NDC
 from ctm_plugin.rays.sampling import intersect_box
@@ -71,6 +71,10 @@ class Box(nn.Module):
         """Distances in the world of samples at ``t`` along the rays ``rays[at]`` of the world."""
         return t
 
+    def place(self, points: Tensor) -> tuple[Tensor, Tensor | float]:
+        """The world's points ``[M, 3]`` in the space, and the length of a world's unit there, as :meth:`lengths`."""
+        return points, 1 / self.measure
+
 
 class NDCSpace(Box):
     """Normalised device coordinates of forward-facing cameras: rays run from 0 to 1, the measure is 1."""
@@ -87,6 +91,10 @@ class NDCSpace(Box):
 
     def distances(self, rays: Rays, t: Tensor, at: Any) -> Tensor:
         return self.ndc.distances(rays[at], t, self.behind)
+
+    def place(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        local, unit = self.ndc.points(points)
+        return local, unit / self.measure
 
 
 class Ball(Box):
@@ -122,6 +130,10 @@ class Ball(Box):
 
     def distances(self, rays: Rays, t: Tensor, at: Any) -> Tensor:
         return (travelled(t) * self.radius).clamp_max(self.behind)
+
+    def place(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        local = contract((points - self.centre) / self.radius)
+        return local, (2 - distance(local)).clamp_max(1.0).square() / (self.measure * self.radius)
 
 
 def space_of(scene: Scene, geometry: str, box: Tensor | None = None) -> Box:

@@ -46,6 +46,17 @@ class NDC(NamedTuple):
             torch.stack([self.scale_x * along_x, self.scale_y * along_y, 2 * ones], dim=1),
         )
 
+    def points(self, points: Float[Tensor, "m 3"]) -> tuple[Float[Tensor, "m 3"], Float[Tensor, " m"]]:
+        """Give points of the world in NDC, and how far ``t`` goes there for a unit of depth: ``near / depth^2``.
+
+        Args:
+            points: with z < 0; what lies nearer than a thousandth of ``near`` counts as there.
+        """
+        depth = (-points[:, 2]).clamp_min(1e-3 * self.near)
+        x, y = points[:, 0] / depth, points[:, 1] / depth
+        local = torch.stack([self.scale_x * x, self.scale_y * y, 1 - 2 * self.near / depth], dim=1)
+        return local, self.near / depth.square()
+
     def distances(self, rays: Rays, t: Float[Tensor, "*r"], far: float) -> Float[Tensor, "*r"]:
         """Find distances along the world's rays, up to ``far``, of the points at ``t`` in [0, 1] along those of NDC.
 

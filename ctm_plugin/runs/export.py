@@ -1,4 +1,4 @@
-"""Exports of a run for other programs: splats, points, cameras, lit pictures; and a page for people."""
+"""Exports of a run for other programs: splats, points, a mesh, cameras, lit pictures; and a page for people."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from ctm_plugin.runs.page import write_page
 from ctm_plugin.runs.rundir import ALL, PAGE
 from ctm_plugin.runs.settings import ExportConfig
 from ctm_plugin.runs.splats import TRAIN_STEPS, likeness, lit_view, plain, read_splats, write_splats
-from ctm_plugin.runs.surface import Surface, cloud
+from ctm_plugin.runs.surface import Surface, cloud, mesh
 from ctm_plugin.runs.video import check_new
 from ctm_plugin.scene.poses import IDENTITY
 from ctm_plugin.scene.views import Scene, Views, composite
@@ -36,12 +36,14 @@ FOLDER_EXPORTS = ("cameras", "pictures")
 
 
 def export(run: Path, settings: ExportConfig) -> None:
-    """Write what a run found for other programs: splats, points, cameras or pictures.
+    """Write what a run found for other programs: splats, points, a mesh, cameras or pictures.
 
     Numbers are in the files' units.
 
     - ``splats``: the Gaussians as a PLY of 3DGS, in lit RGB. The verb says how close its pictures are to the run's.
     - ``points``: where the training views' rays end, with colours and normals, as a binary PLY.
+    - ``mesh``: marching cubes, with colours as seen head-on, of what the training views see up to far; of unbounded
+      scenes, of the ball of cameras.
     - ``cameras``: nerfstudio's ``transforms.json`` and COLMAP's ``sparse/0``, with the pictures that it was trained on.
     - ``pictures``: the same folder for programs that train on lit pictures: all training and test views, rendered lit,
       with masks and points. They have the size that the run was trained at: larger ones would show no more. With
@@ -50,7 +52,7 @@ def export(run: Path, settings: ExportConfig) -> None:
 
     Raises:
         CTMError: the folder is no run, its checkpoint cannot be used, it is not of a scene with cameras, there are no
-            splats, no ray ends, or files are there already.
+            splats, there is no surface, or files are there already.
     """
     if settings.what == "page":
         place = (Path(settings.out) if settings.out else run) / PAGE
@@ -64,7 +66,9 @@ def export(run: Path, settings: ExportConfig) -> None:
     light, splats = chosen_light(settings, posed.light), isinstance(module, Splat)
     what = settings.what or ("splats" if splats else "points")
     if what == "splats" and not splats:
-        raise ConfigError("what", what, f"points: a {type(module).__name__} has no Gaussians")
+        raise ConfigError("what", what, f"points or mesh: a {type(module).__name__} has no Gaussians")
+    if what == "mesh" and splats:
+        raise ConfigError("what", what, "points or splats: a mesh needs a run of backbone=dvgo, ngp or nerf")
     place = out / ("photographs" if settings.photographs else what if what in FOLDER_EXPORTS else f"{what}.ply")
     if not settings.overwrite:
         there = place.rglob("*") if place.is_dir() else [place]
@@ -76,7 +80,8 @@ def export(run: Path, settings: ExportConfig) -> None:
     elif what == "pictures":
         write_pictures(place, module, light, settings)
     else:
-        write_surface(place, cloud(module, settings.points, settings.opaque), module.scene, light)
+        surface, fine = (cloud, settings.points) if what == "points" else (mesh, settings.cells)
+        write_surface(place, surface(module, fine, settings.opaque), module.scene, light)
     print(f"written to {place}")
     if what in ("cameras", "pictures"):
         print(f"next: ns-train splatfacto --data {shlex.quote(str(place))}")
@@ -112,7 +117,7 @@ def write_lit(path: Path, module: Splat, light: Light) -> None:
 def write_surface(path: Path, surface: Surface, scene: Scene, light: Light) -> None:
     """Write a surface in the files' world, its colours lit."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_ply(path, *dots_of(surface, scene, light))
+    write_ply(path, *dots_of(surface, scene, light), None if surface.faces is None else surface.faces.numpy())
 
 
 def dots_of(surface: Surface, scene: Scene, light: Light) -> Dots:

@@ -13,7 +13,7 @@ from ctm_plugin.settings.setting import REQUIRED, Settings, setting
 
 CAMERA_PATHS = ("capture", "orbit", "spiral", "test")
 """Names of camera paths."""
-EXPORTS = ("splats", "points", "cameras", "pictures", "page")
+EXPORTS = ("splats", "points", "mesh", "cameras", "pictures", "page")
 """Names of the kinds of exports of a run."""
 
 
@@ -112,13 +112,19 @@ class ExportConfig(LitConfig):
 
     what: str | None = setting(
         None,
-        "splats or points (.ply), cameras (with photographs), pictures (lit) or "
+        "splats, points or mesh (.ply), cameras (with photographs), pictures (lit) or "
         "page; null: splats where there are some, else points",
         choices=EXPORTS,
     )
     out: str | None = setting(None, "folder to write to; null: RUN_DIR/export, of what=page RUN_DIR")
     points: int = setting(200_000, "largest number of points", least=1)
-    opaque: float = setting(0.5, "share of light that a point's ray stops", above=0, below=1)
+    cells: int = setting(128, "cells of the mesh along its longest side", least=2, most=2048)
+    opaque: float = setting(
+        0.5,
+        "share of light that a point's ray stops, or that a hundredth of the mesh's side stops at its surface",
+        above=0,
+        below=1,
+    )
     photographs: bool = setting(False, "of what=pictures: the photographs, lit, in place of renderings")
     overwrite: bool = setting(False, "replace existing files")
 

@@ -85,7 +85,7 @@ VERBS = {
         "render a lit film of a run", "RUN_DIR", "ctm_plugin.runs.video:render", "ctm_plugin.runs.settings:VideoConfig"
     ),
     "export": Verb(
-        "write a run's splats, points or cameras for other programs", "RUN_DIR",
+        "write a run's splats, points, mesh or cameras for other programs", "RUN_DIR",
         "ctm_plugin.runs.export:export", "ctm_plugin.runs.settings:ExportConfig",
     ),
     "view": Verb(

@@ -135,4 +135,7 @@ def test_pictures_are_made_with_the_mean_of_the_latest_parameters(make, name, ge
     batch = module.draw(module.draws(0))
     assert module.predict(batch, module.draws(0)).opacity.any()
     assert not module.eval().render_rays(batch.rays).opacity.any()
-    assert module.train().render_rays(batch.rays).opacity.any()
+    rays = some_rays(module)
+    points = rays.origins + 0.5 * (module.scene.near + module.scene.far) * rays.directions
+    assert not module.query(points, rays.directions)[0].any()
+    assert module.train().query(points, rays.directions)[0].any()

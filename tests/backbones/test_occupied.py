@@ -151,6 +151,35 @@ def test_hits_miss_no_ray(scene):
     assert not field.hits(rays).any()
 
 
+def test_query_is_density_a_unit_of_length(scene):
+    """Of the world, in NDC of depth: the optical depth of a short way divided by its length."""
+    field, rays = painted(scene), rays_of(scene)
+    field.space.divide(field.space.longest / 10_000)
+    t, ray, points = field.samples(field.space.local(rays), 0.5)
+    ends = [field.space.distances(rays, t + side * field.space.stride / 2, ray) for side in (-1, 1)]
+    some = (ends[1] < 0.5 * scene.far) & (torch.rand(len(t)) < 1e-2)
+    if scene.geometry == "forward":
+        ends = [end * -rays.directions[ray, 2] for end in ends]
+    depth = field.evaluate(points)[0] * field.space.lengths(t, points)
+    middle = field.space.distances(rays, t, ray)[:, None]
+    found, latent = field.query((rays.origins[ray] + middle * rays.directions[ray])[some], rays.directions[ray][some])
+    loose = {"bounded": 0.02, "forward": 0.02, "unbounded": 0.5}[scene.geometry]
+    expected = (depth / (ends[1] - ends[0]))[some]
+    assert some.sum() > 100
+    assert (found / expected).log().abs().median() < loose
+    torch.testing.assert_close(latent, color(points, rays.directions[ray])[some], atol=1e-3, rtol=0)
+
+
+def test_a_query_outside_or_in_free_space_finds_nothing(scene):
+    field, points = painted(scene), torch.randn(50, 3) - torch.tensor([0.0, 0.0, 6.0])
+    density = field.query(points, torch.tensor([[0.0, 0.0, -1.0]]).expand(50, 3))[0]
+    low, high = field.space.aabb
+    local = field.space.place(points)[0]
+    assert torch.equal(density > 0, ((local >= low) & (local <= high)).all(1))
+    field.occupancy[:] = False
+    assert not field.query(points, torch.tensor([[0.0, 0.0, -1.0]]).expand(50, 3))[0].any()
+
+
 @pytest.mark.parametrize("distance", [1.5, 5.0, 40.0])
 def test_without_bounds_near_and_far_walls_are_where_they_are(ball, distance):
     """Shells of radius ``distance`` round the middle, seen from inside or from outside."""

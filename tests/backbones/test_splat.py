@@ -18,7 +18,7 @@ from ctm_plugin.backbones.splat import RESET_OPACITY, Splat
 from ctm_plugin.color.dssim import dssim
 from ctm_plugin.color.photometric import Photometric
 from ctm_plugin.data.blender import BlenderConfig
-from ctm_plugin.errors import CheckpointError, Interrupted
+from ctm_plugin.errors import CheckpointError, CTMError, Interrupted
 from ctm_plugin.runs.assemble import assemble
 from ctm_plugin.runs.evaluate import evaluate
 from ctm_plugin.runs.load import load_posed
@@ -375,6 +375,8 @@ def test_what_dashboards_are_told(grown):
     assert module.stats() == {"gaussians": float(len(module.gaussians.means))}
     assert {"test/depth"} < module.snapshot(0).pictures.keys()
     assert 2 < float(module.render_view(module.scene.test, 0)["depth"].min()) < 6
+    with pytest.raises(CTMError, match="Splat has no method query"):
+        module.query(torch.zeros(1, 3), torch.zeros(1, 3))
 
 
 # Runs

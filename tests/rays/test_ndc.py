@@ -40,6 +40,20 @@ def test_rays_in_ndc_pass_the_same_points(seed, t):
     torch.testing.assert_close(warped.origins + t * warped.directions, coordinates(points), rtol=1e-9, atol=1e-9)
 
 
+@given(SEED)
+def test_points_and_their_pace(seed):
+    """The pace is the slope of t = (z + 1) / 2 by depth; what is nearer than ``near / 1000`` counts as there."""
+    rays = looking_forward(seed)
+    depths = torch.linspace(0.05, 40.0, 50, dtype=torch.float64)
+    points = (rays.directions / -rays.directions[:, 2:] * depths[:, None]).requires_grad_()
+    local, pace = SOME.points(points)
+    torch.testing.assert_close(local, coordinates(points), rtol=1e-9, atol=1e-9)
+    (slopes,) = torch.autograd.grad(local[:, 2].sum() / 2, points)
+    torch.testing.assert_close(pace, -slopes[:, 2], rtol=1e-9, atol=0)
+    near = torch.tensor([[0.0, 0.0, -0.001 * SOME.near], [0.0, 0.0, 0.5]], dtype=torch.float64)
+    torch.testing.assert_close(*SOME.points(near)[0])
+
+
 def test_the_image_of_the_reference_camera_fills_the_cube():
     # 8 x 6 pixels, focal length 4: the right edge of the image lies at x = 4/4 of the depth, the top at y = 3/4.
     ndc = NDC(2 * 4 / 8, 2 * 4 / 6, near=2.0)

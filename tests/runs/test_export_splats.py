@@ -146,8 +146,13 @@ def test_points_of_splats(run, tmp_path):
     """Normals have unit length and face the cameras."""
     command = ["export", str(run), "what=points", f"out={tmp_path}", "opaque=0.1", "light=off"]
     assert main(command) == 0
-    vertices = parsed(tmp_path / "points.ply")
+    vertices, _ = parsed(tmp_path / "points.ply")
     np.testing.assert_allclose(np.linalg.norm(vertices[:, 3:6], axis=1), 1, atol=1e-5)
     centres = load_posed(run).module.c2w[:, :, 3].numpy()
     facing = ((centres[None] - vertices[:, None, :3]) * vertices[:, None, 3:6]).sum(-1)
     assert (facing.max(1) > 0).all()
+
+
+def test_what_a_run_does_not_have(run, tmp_path, refused):
+    told = "found 'mesh', expected points or splats: a mesh needs a run of backbone=dvgo, "
+    assert told in refused("export", run, "what=mesh", f"out={tmp_path}")

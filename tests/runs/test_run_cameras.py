@@ -32,9 +32,9 @@ KINDS = {
 
 def made(run: Path, out: str) -> dict[str, bytes]:
     """What render and export write, but for pictures of the data."""
-    kinds = ("points", "cameras", "pictures", *(("splats",) if "splat" in run.name else ()))
+    kinds = ("points", "cameras", "pictures", *(("splats",) if "splat" in run.name else ("mesh",)))
     for what in kinds:
-        settings = (f"what={what}", f"out={run / out}", "points=500", "opaque=0.0003")
+        settings = (f"what={what}", f"out={run / out}", "points=500", "cells=8", "opaque=0.0003")
         assert main(["export", str(run), *settings]) == 0
     assert main(["render", str(run), "what=all", "frames=2", f"out={run / out / 'film.gif'}"]) == 0
     files = [path for path in (run / out).rglob("*") if path.is_file() and "images" not in path.parts]
