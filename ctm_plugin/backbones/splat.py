@@ -26,6 +26,7 @@ from ctm_plugin.splats.gaussians import Camera, Gaussians, camera_of
 from ctm_plugin.splats.growth import Change, densify
 from ctm_plugin.splats.render import INVERSE_CHANNELS, PLANE_CHANNELS, bends, expected_depth, picture
 from ctm_plugin.splats.scales import Stage, averaged, stages
+from ctm_plugin.splats.seen import as_wide_as_pixels
 from ctm_plugin.splats.start import SH_C0, first_gaussians, first_places
 
 MIN_RANGE = 0.002
@@ -168,8 +169,9 @@ class Splat(PictureBackbone):
         depth, inverse_depth = draws is None, draws is not None and self.config.bend > 0
         shift = torch.zeros(len(self.grad2d), 2, device=self.device, requires_grad=not depth)
         more = PLANE_CHANNELS if depth else INVERSE_CHANNELS * inverse_depth
+        gaussians = self._without_gaps(camera) if depth else self.gaussians
         with torch.autocast(self.device.type, enabled=False):
-            image, transmittance = picture(self.gaussians, camera, shift, self.degrees, -self.low / self.range, more)
+            image, transmittance = picture(gaussians, camera, shift, self.degrees, -self.low / self.range, more)
             colors = (
                 image[: self.channels] + transmittance * ((background.float() - self.low) / self.range).T[:, :, None]
             )
@@ -183,6 +185,16 @@ class Splat(PictureBackbone):
         self.depths.clear()
         self.shifts.clear()  # of steps that no Trainer took
         return super().predict(batch, draws)
+
+    def _without_gaps(self, camera: Camera) -> Gaussians:
+        """The Gaussians, wider where a camera's pixels are smaller than those of all training views.
+
+        A picture adds a variance of 0.3 pixels squared: of finer pixels that is less, and gaps open.
+        """
+        known = [self._camera(self.views, index, 1) for index in range(len(self.views))]
+        focal = max(float(each.lens[:2].mean()) for each in known)
+        share = 1 - (focal / float(camera.lens[:2].mean())) ** 2
+        return as_wide_as_pixels(self.gaussians, known, share) if share > 0 else self.gaussians
 
     def _camera(self, views: Views, index: int, every: int) -> Camera:
         """The view's camera, cached for training views: finding where a lens ends takes a while."""

@@ -37,12 +37,12 @@ def times_seen(places: Float[Tensor, "n 3"], cameras: Sequence[Camera]) -> Int64
     return times
 
 
-def as_wide_as_pixels(gaussians: Gaussians, cameras: Sequence[Camera]) -> Gaussians:
-    """Widen Gaussians by what pictures add to each, as the nearest camera sees it: ``s^2 + 0.3 (d / f)^2``.
+def as_wide_as_pixels(gaussians: Gaussians, cameras: Sequence[Camera], share: float = 1.0) -> Gaussians:
+    """Widen Gaussians by a share of what pictures add to each, as the nearest camera sees it: ``s^2 + 0.3 (d / f)^2``.
 
     So that pictures with smaller pixels than those that it was trained on have no gaps.
     """
     centres = torch.stack([camera.centre for camera in cameras])
     pixels = torch.stack([1 / camera.lens[:2].mean() for camera in cameras])
     pixel = (torch.cdist(gaussians.means, centres) * pixels).amin(1, keepdim=True)
-    return gaussians._replace(scales=((2 * gaussians.scales).exp() + EPS2D * pixel.square()).log() / 2)
+    return gaussians._replace(scales=((2 * gaussians.scales).exp() + share * EPS2D * pixel.square()).log() / 2)
