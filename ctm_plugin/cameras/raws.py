@@ -1,4 +1,4 @@
-"""Raw pictures of a capture, developed alike into a folder where its photographs are looked for."""
+"""Development of a capture's raw pictures, all alike, into a folder of its photographs."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ HALF_SIZE_SIDE = 3000
 
 
 def develop_raws(root: Path) -> None:
-    """Develop the raw pictures in a folder and those below it to TIFF of 16 bits, and say so.
+    """Develop the raw pictures in a folder and below it to TIFF of 16 bits, and print how many.
 
-    All have the white balance that the camera chose for one of them, the median of red to blue. Where exposures differ,
-    shorter ones are brightened to the level of the longest. All are developed anew unless all are there.
+    All get the white balance of the picture with the median ratio of red to blue. Where exposures differ, shorter ones
+    are brightened to the level of the longest. All are developed anew unless all developed files exist.
 
     Raises:
-        DataError: not one can be developed.
+        DataError: no picture can be developed.
     """
     targets = {path: path.parent / DEVELOPED / f"{path.stem}.tif" for path in below(root) if is_raw(path)}
     if not targets:

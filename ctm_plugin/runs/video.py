@@ -1,4 +1,4 @@
-"""A video of a run."""
+"""Films of a run along a camera path, as GIF, WebP or H.264."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ FILM_WIDTH, MAX_SCALE = 1280, 2.0
 """Width in pixels that films of splats reach, at most so many times the training's: there they are 0.05 dB closer to
 larger photographs than enlarged pictures are (RealX3D's MilkCookie, trained 300 pixels wide)."""
 MIN_PRINCIPAL = 0.9
-"""Share of the middle's coordinate below which a principal point is that of a smaller picture on a larger canvas."""
+"""Principal point's coordinate, as a share of the picture's middle, below which the picture lies on a larger canvas."""
 
 
 def render(run: Path, settings: VideoConfig) -> None:
@@ -60,7 +60,7 @@ def film(run: Path, settings: VideoConfig) -> Path:
     """Write a film, see :func:`render`.
 
     Returns:
-        Its file.
+        The film's file.
     """
     posed = load_posed(run, settings.dataset.root, pictures=False)
     module, scene = posed.module, posed.module.scene
@@ -93,10 +93,10 @@ def film(run: Path, settings: VideoConfig) -> Path:
 
 
 def check_new(files: Iterable[Path]) -> None:
-    """Refuse to replace files that are there.
+    """Refuse to overwrite existing files.
 
     Raises:
-        ConfigError: one is.
+        ConfigError: a file exists.
     """
     for file in files:
         if file.exists():
@@ -104,8 +104,8 @@ def check_new(files: Iterable[Path]) -> None:
 
 
 def film_cameras(scene: Scene, path: str | KeyFrames, frames: int, scale: float = 1.0) -> list[Views]:
-    """The cameras of a path, a view each: with the first test view's lens and size, or a pinhole of the field of view
-    that key frames say; in pixels that are ``scale`` times as many along a side.
+    """The cameras of a path, a view each, of ``scale`` times the first test view's size: with its lens, or as a pinhole
+    of the key frames' field of view.
     """
     test = scene.test
     lens, distortion = test.intrinsics[:1], None if test.distortion is None else test.distortion[:1]
@@ -129,26 +129,26 @@ def film_cameras(scene: Scene, path: str | KeyFrames, frames: int, scale: float 
 
 
 def rendered(module: PosedBackbone, cameras: Iterable[Views]) -> Iterator[dict[str, Tensor]]:
-    """Views as :meth:`~PosedBackbone.render_view` gives them with one ray a pixel, on the CPU."""
+    """Render cameras in turn by :meth:`~PosedBackbone.render_view`, one ray a pixel; results on the CPU."""
     for views in cameras:
         with torch.no_grad():
             yield {name: value.float().cpu() for name, value in module.render_view(views, 0, rays=1).items()}
 
 
 def frame(*pictures: Float[Tensor, "h w 3"]) -> np.ndarray:
-    """Pictures side by side, bytes ``[H, W, 3]``, of even sides, as video wants them."""
+    """A film's frame, bytes ``[H, W, 3]``: pictures side by side, cut to even sides, as video codecs need."""
     joined = (beside(*pictures).clamp(0, 1) * 255).round().byte().numpy()
     return np.pad(joined, ((0, len(joined) % 2), (0, joined.shape[1] % 2), (0, 0)), mode="edge")
 
 
 def write_video(path: Path, frames: Sequence[np.ndarray], fps: Number) -> None:
-    """Write frames, see :func:`encoded`."""
+    """Write frames ``[F, H, W, 3]`` as a video file, see :func:`encoded`."""
     with replacing(path) as beside_path:
         beside_path.write_bytes(encoded(np.stack(frames), path.suffix, fps))
 
 
 def encoded(frames: UInt8[np.ndarray, "f h w 3"], ending: str, fps: Number) -> bytes:
-    """A film's frames as a file: GIF, WebP or H.264, as the ending says."""
+    """Encode a film's frames as GIF, WebP or H.264, by the file name's ``ending``."""
     mp4 = {"plugin": "FFMPEG", "fps": fps, "macro_block_size": 2, "output_params": FFMPEG_BT709}
     return iio.imwrite(
         "<bytes>", frames, extension=ending, **(mp4 if ending == ".mp4" else {"duration": 1000 / fps, "loop": 0})

@@ -137,6 +137,7 @@ def test_facts(own):
     assert "wrong" not in pages.facts(posed, posed.light, {"detail": 0.6})[2]
 
 
+@pytest.mark.slow
 def test_in_a_browser(own):
     """It opens as a file, asks nobody for anything, the line moves, and there is a scene to walk through."""
     posed = load_posed(own)

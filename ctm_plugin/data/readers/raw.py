@@ -24,11 +24,11 @@ from ctm_plugin.errors import CTMError
 def open_raw(
     path: Path, brightness: float = 1.0, balance: Sequence[float] | None = None, half: bool = False
 ) -> Iterator[Opened]:
-    """A raw picture, developed the same way for every picture of a scene, so that equal light gives equal colours.
+    """Open a raw picture, developed alike for all pictures of a scene, so that equal light gives equal colours.
 
     Black level subtracted, white level to 1, the camera's own white balance, sRGB's primaries; no automatic brightness,
-    no look at what the picture shows; then times ``brightness``, clipped, and sRGB's curve. The picture stays as the
-    sensor stands: poses are for those.
+    nothing that depends on the picture; then times ``brightness``, clipped, and sRGB's curve. The picture is not
+    turned: poses are for pictures as the sensor stands.
 
     Args:
         path: the file.
@@ -64,7 +64,7 @@ def open_raw(
 
 
 def require_rawpy() -> ModuleType:
-    """LibRaw as a module."""
+    """Import rawpy, LibRaw's module, or name the extra that is missing."""
     try:
         import rawpy
     except ImportError as error:
@@ -76,8 +76,8 @@ class RawHeader(NamedTuple):
     """Metadata of a raw picture.
 
     Attributes:
-        side: the longer one in pixels.
-        orientation: how it is to be turned, in EXIF's numbers.
+        side: the longer side in pixels.
+        orientation: the turn that makes it upright, in EXIF's numbers.
         balance: the camera's factors on red, green, blue and the second green.
         exposure: see :func:`raw_exposure`.
     """
@@ -89,7 +89,7 @@ class RawHeader(NamedTuple):
 
 
 def read_raw(path: Path) -> RawHeader:
-    """Read what a raw picture says of itself, without developing it."""
+    """Read a raw picture's metadata, without developing it."""
     rawpy = require_rawpy()
     expected = "a raw picture that LibRaw can develop: copy it here again, or leave it out"
     require_file(path, expected)
@@ -100,9 +100,9 @@ def read_raw(path: Path) -> RawHeader:
 
 
 def raw_exposure(path: Path) -> float | None:
-    """The light that a raw picture took, see :func:`exposure_of`, by its own EXIF, which DNG may have on top.
+    """Exposure of a raw picture by its EXIF, see :func:`exposure_of`; a DNG may have it in its first directory.
 
-    ``None``: it does not tell, or is none of the many kinds that are TIFFs inside.
+    ``None``: EXIF does not give it, or the file is not based on TIFF, as most raw formats are.
     """
     exif = Image.Exif()
     try:
