@@ -43,6 +43,8 @@ SPLAT_COST = 0.7
 """Cost of rendering the full number of Gaussians, where a step's pixels cost 1."""
 PARTS = 64
 """Number of equal parts in which the cost of a range of steps is summed."""
+MIN_SHARE = 0.01
+"""Least part of a pixel's variance that is filled: lenses of one capture differ by less."""
 
 
 class Splat(PictureBackbone):
@@ -191,10 +193,12 @@ class Splat(PictureBackbone):
 
         A picture adds a variance of 0.3 pixels squared: of finer pixels that is less, and gaps open.
         """
-        known = [self._camera(self.views, index, 1) for index in range(len(self.views))]
-        focal = max(float(each.lens[:2].mean()) for each in known)
+        focal = float(self.views.intrinsics[:, :2].mean(1).max())
         share = 1 - (focal / float(camera.lens[:2].mean())) ** 2
-        return as_wide_as_pixels(self.gaussians, known, share) if share > 0 else self.gaussians
+        if share <= MIN_SHARE:
+            return self.gaussians
+        known = [self._camera(self.views, index, 1) for index in range(len(self.views))]
+        return as_wide_as_pixels(self.gaussians, known, share)
 
     def _camera(self, views: Views, index: int, every: int) -> Camera:
         """The view's camera, cached for training views: finding where a lens ends takes a while."""
