@@ -29,7 +29,7 @@ from rich.console import Console
 from ctm_plugin import __version__
 from ctm_plugin.cpu.threads import let_waiting_threads_sleep
 from ctm_plugin.errors import ConfigError, CTMError, Interrupted
-from ctm_plugin.runs.choices import told, with_fitting_dataset
+from ctm_plugin.runs.choices import register, told, with_fitting_dataset
 from ctm_plugin.runs.compose import (
     GROUPS,
     at_work,
@@ -46,7 +46,8 @@ from ctm_plugin.settings import commands
 from ctm_plugin.settings.as_typed import is_sweep
 from ctm_plugin.settings.build import SECTIONS, unknown_key
 from ctm_plugin.settings.listing import plain, print_choices, print_keys, print_names
-from ctm_plugin.settings.registry import REGISTRIES
+from ctm_plugin.settings.registry import REGISTRIES, load
+from ctm_plugin.settings.setting import keys
 
 USER_ERRORS = (CTMError, HydraException, OmegaConfBaseException, OSError)
 """Errors that a user can mend; others are bugs, of ours or of another package's."""
@@ -135,6 +136,8 @@ def _run(arguments: list[str]) -> None:
         commands.print_verbs()
         print()
         print_names(Console(), conf_dir(), MAIN_GROUPS)
+    elif {"-sc", "--shell-completion"} & set(arguments):
+        _complete(arguments[1:])
     elif {"-V", "--version"} & set(arguments):
         print(f"ctm_plugin {__version__}")
     else:
@@ -166,6 +169,26 @@ def print_list(*groups: Path, others: Sequence[str] = ()) -> None:
         if registry and name in registry.names() and any(each.lstrip("+").startswith(f"{group}=") for each in chosen):
             print(f"{plain(registry.docstring(name))}\n")
         print_keys(Console(), group, config[group], told(group, name))
+
+
+def _complete(request: Sequence[str]) -> None:
+    """Print what a shell asks for: Hydra's script for it, or how its line may go on, verbs and their keys included."""
+    what, _, shell = " ".join(request).partition("=")
+    if what not in ("install", "uninstall", "query") or shell not in commands.SHELLS:
+        expected = f"install=SHELL or uninstall=SHELL, of {', '.join(commands.SHELLS)}"
+        raise commands.UsageError(f"found {' '.join(request) or 'nothing'} after -sc, expected {expected}")
+    if what == "query":
+        program, *words, last = os.environ.get("COMP_LINE", "ctm ").split(" ")
+        verb = commands.VERBS.get(words[0]) if words else None
+        own = [f"{key}=" for key in keys(load(verb.kind))] if verb else [] if words else commands.names()
+        print("\n".join(each for each in own if each.startswith(last)))
+        if verb and verb.others != commands.TRAINING:
+            return
+        given = [each for each in words if "=" in each or each.startswith("-")]
+        os.environ["COMP_LINE"] = " ".join([program, *given, last])  # Hydra reads overrides and its own flags
+    register(None)
+    with at_work(), suppress(HydraException):  # a line that cannot be composed yet has no more
+        GlobalHydra.instance().hydra.shell_completion("config", list(request))
 
 
 def _train(arguments: Sequence[str]) -> None:

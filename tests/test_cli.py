@@ -8,6 +8,7 @@ import threading
 import warnings
 from contextlib import nullcontext
 from pathlib import Path
+from shutil import which
 
 import pytest
 import yaml
@@ -99,6 +100,44 @@ def test_what_hydra_prints(small, capsys):
     assert capsys.readouterr().out.startswith("# @package hydra.run\ndir: runs/${scene:}_")
     assert main(["--cfg", "all", "-p", "hydra.job.name"]) == 0
     assert capsys.readouterr().out == "cli\n"
+
+
+@pytest.mark.parametrize(
+    ("line", "expected"),
+    [
+        ("ctm ph", ["photos"]),
+        ("ctm backbone=n", ["backbone=nerf", "backbone=ngp"]),
+        ("ctm -m backbone=splat trainer.mi", ["trainer.minutes="]),
+        ("ctm photos FOLDER mi", ["minutes="]),
+        ("ctm photos FOLDER dataset.wi", ["dataset.width="]),
+        ("ctm render last seed", []),
+        ("ctm backbone=nerve trainer.mi", []),
+    ],
+)
+def test_a_shell_completes_verbs_choices_and_keys(line, expected, monkeypatch, capsys):
+    monkeypatch.setenv("COMP_LINE", line)
+    assert main(["-sc", "query=bash"]) == 0
+    assert capsys.readouterr().out.split() == expected
+
+
+@pytest.mark.skipif(which("bash") is None, reason="no bash")
+def test_what_bash_is_told_to_run_completes(monkeypatch, capsys, tmp_path):
+    monkeypatch.setattr(sys, "argv", ["/bin/ctm"])
+    assert main(["-sc", "install=bash"]) == 0
+    (tmp_path / "ctm").write_text(f'#!/bin/sh\nexec "{sys.executable}" -m ctm_plugin "$@"\n')
+    (tmp_path / "ctm").chmod(0o755)
+    words = 'COMP_LINE="ctm backbone=sp" COMP_POINT=15 COMP_CWORD=1; hydra_bash_completion; echo "${COMPREPLY[@]}"'
+    path = {"PATH": f"{tmp_path}:{os.environ['PATH']}"}
+    script = ["bash", "-c", f"{capsys.readouterr().out}\n{words}"]
+    done = subprocess.run(script, env=os.environ | path, capture_output=True, text=True, check=True)
+    assert done.stdout == "backbone=splat\n"
+
+
+def test_a_shell_that_is_not_completed_in(capsys):
+    assert main(["-sc", "install=tcsh"]) == main(["-sc"]) == 2
+    told = capsys.readouterr().err
+    assert "found install=tcsh after -sc, expected install=SHELL" in told
+    assert "found nothing after -sc" in told
 
 
 def test_choices_in_a_folder_that_is_not_there(refused):

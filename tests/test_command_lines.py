@@ -41,7 +41,7 @@ TYPED = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs" / f"{name
 EXAMPLES = ("tiny_backbone", "ctm_controls", "ctm_scenes")
 """Packages of the documentation that say what they have without anything else."""
 VERBS = OURS | {"scenes": VERB}
-OF_OTHERS = ("ns-train", "ns-eval", "sbatch", "source")
+OF_OTHERS = ("ns-train", "ns-eval", "sbatch", "source", "eval")
 """Not ours: nerfstudio (``make test-nerfstudio``), SLURM's (``test_cluster.py``), the shell."""
 FENCE = re.compile(r"^( *)```(\w*)\n(.*?)^\1```$", re.M | re.S)
 INLINE = re.compile(r"(?:[A-Z_]+=\S+\s+)*(?:python|make|ctm|pip|tensorboard)\s+\S")
@@ -165,9 +165,10 @@ def begun(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[str]:
         return begin
 
     for verb in VERBS.keys() - {"train", "list"}:
-        module, _, name = VERBS[verb].entry.partition(":")
-        module = importlib.import_module(module)
-        monkeypatch.setattr(module, name, stand_in(verb, getattr(module, name)))
+        for entry in filter(None, (VERBS[verb].entry, VERBS[verb].dry_run)):
+            module, _, name = entry.partition(":")
+            module = importlib.import_module(module)
+            monkeypatch.setattr(module, name, stand_in(verb, getattr(module, name)))
     monkeypatch.setenv("CTM_DATA", "data")
     monkeypatch.setenv("CTM_SCENES", "scenes")
     monkeypatch.setattr(rundir, "runs_of", lambda path: [path])

@@ -26,6 +26,7 @@ from ctm_plugin.splats.gaussians import Camera, Gaussians, camera_of
 from ctm_plugin.splats.growth import Change, densify
 from ctm_plugin.splats.render import INVERSE_CHANNELS, PLANE_CHANNELS, bends, expected_depth, picture
 from ctm_plugin.splats.scales import Stage, averaged, stages
+from ctm_plugin.splats.seen import as_wide_as_pixels
 from ctm_plugin.splats.start import SH_C0, first_gaussians, first_places
 
 MIN_RANGE = 0.002
@@ -42,6 +43,8 @@ SPLAT_COST = 0.7
 """Cost of rendering the full number of Gaussians, where a step's pixels cost 1."""
 PARTS = 64
 """Number of equal parts in which the cost of a range of steps is summed."""
+MIN_SHARE = 0.01
+"""Least part of a pixel's variance that is filled: lenses of one capture differ by less."""
 
 
 class Splat(PictureBackbone):
@@ -168,8 +171,9 @@ class Splat(PictureBackbone):
         depth, inverse_depth = draws is None, draws is not None and self.config.bend > 0
         shift = torch.zeros(len(self.grad2d), 2, device=self.device, requires_grad=not depth)
         more = PLANE_CHANNELS if depth else INVERSE_CHANNELS * inverse_depth
+        gaussians = self._without_gaps(camera) if depth else self.gaussians
         with torch.autocast(self.device.type, enabled=False):
-            image, transmittance = picture(self.gaussians, camera, shift, self.degrees, -self.low / self.range, more)
+            image, transmittance = picture(gaussians, camera, shift, self.degrees, -self.low / self.range, more)
             colors = (
                 image[: self.channels] + transmittance * ((background.float() - self.low) / self.range).T[:, :, None]
             )
@@ -183,6 +187,18 @@ class Splat(PictureBackbone):
         self.depths.clear()
         self.shifts.clear()  # of steps that no Trainer took
         return super().predict(batch, draws)
+
+    def _without_gaps(self, camera: Camera) -> Gaussians:
+        """The Gaussians, wider where a camera's pixels are smaller than those of all training views.
+
+        A picture adds a variance of 0.3 pixels squared: of finer pixels that is less, and gaps open.
+        """
+        focal = float(self.views.intrinsics[:, :2].mean(1).max())
+        share = 1 - (focal / float(camera.lens[:2].mean())) ** 2
+        if share <= MIN_SHARE:
+            return self.gaussians
+        known = [self._camera(self.views, index, 1) for index in range(len(self.views))]
+        return as_wide_as_pixels(self.gaussians, known, share)
 
     def _camera(self, views: Views, index: int, every: int) -> Camera:
         """The view's camera, cached for training views: finding where a lens ends takes a while."""

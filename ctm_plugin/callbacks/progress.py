@@ -25,11 +25,10 @@ class ProgressLine(L.Callback):
         self._stack = ExitStack()
         self._shown: Update | None = None
         self._last = (0.0, 0)
+        self._first: tuple[float, int] | None = None
 
     def on_train_start(self, trainer: L.Trainer, pl_module: Backbone) -> None:
-        self._last = (time.perf_counter(), trainer.global_step)
-        if trainer.is_global_zero and (fit := pl_module.transform.describe()):
-            self.console.print(f"fitted to the scene's colours: {fit}", highlight=False, markup=False)
+        self._last, self._first = (time.perf_counter(), trainer.global_step), None
         if self.console.is_terminal and trainer.is_global_zero:
             shown = bar("training", pl_module.schedule_steps, int(pl_module.scheduled), self.console)
             self._shown = self._stack.enter_context(shown)
@@ -37,6 +36,7 @@ class ProgressLine(L.Callback):
     def on_train_batch_end(self, trainer: L.Trainer, pl_module: Backbone, outputs: Any, *_: Any) -> None:
         now, step = time.perf_counter(), trainer.global_step
         then, before = self._last
+        since, first = self._first = self._first or (now, step)  # after the first step, which compiles
         if not trainer.is_global_zero or (now - then < self.refresh and step < trainer.max_steps):
             return
         rays = trainer.accumulate_grad_batches * pl_module.rays(before, step) / max(now - then, 1e-9)
@@ -48,8 +48,9 @@ class ProgressLine(L.Callback):
         if self._shown is not None:
             self._shown(pl_module.scheduled, figures, None if deadline is None else deadline.left)
         elif step > before:
-            left = deadline.left if deadline else (trainer.max_steps - step) * (now - then) / (step - before)
-            self.console.print(f"{stage} {step}/{trainer.max_steps}  {figures}  ETA {left:.0f} s", highlight=False)
+            left = deadline.left if deadline else (trainer.max_steps - step) * (now - since) / max(step - first, 1)
+            eta = f"  ETA {left:.0f} s" if deadline or step > first else ""
+            self.console.print(f"{stage} {step}/{trainer.max_steps}  {figures}{eta}", highlight=False)
         self._last = (now, step)
 
     def teardown(self, *_: Any, **__: Any) -> None:

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+import shlex
 import tempfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from ctm_plugin.cameras.clips import root_of, take_frames
-from ctm_plugin.cameras.photographs import added, below, home_of, list_photographs
+from ctm_plugin.cameras.photographs import PICTURE_SUFFIXES, added, below, home_of, list_photographs
 from ctm_plugin.cameras.raws import develop_raws
 from ctm_plugin.cameras.settings import DEFAULT_FOLDER, CamerasConfig
+from ctm_plugin.data.readers.clip import CLIP_SUFFIXES
 from ctm_plugin.data.readers.folders import is_picture, require_folder
 from ctm_plugin.data.readers.images import read_picture
 from ctm_plugin.data.readers.layouts import layouts
-from ctm_plugin.errors import CheckpointError, ConfigError
+from ctm_plugin.errors import CheckpointError, ConfigError, DataError
 from ctm_plugin.runs.compose import compose
 from ctm_plugin.runs.decide import composites_there, has_gpu
 from ctm_plugin.runs.rundir import ALL, CONFIG, METRICS, PAGE, film_of, load_config
@@ -24,6 +26,8 @@ from ctm_plugin.show.bars import whole
 
 RUNS = Path("runs")
 """Folder of the runs."""
+NO_CAMERAS = "none found"
+"""Why cameras are searched where there never were any."""
 TIMED_BACKBONE = "splat"
 """The backbone whose schedule follows the clock."""
 LENGTH_KEYS = {"trainer", "trainer.minutes", "backbone.steps"}
@@ -37,6 +41,7 @@ def photos(folder: Path, settings: PhotosConfig, others: Sequence[str] = ()) -> 
 
     FOLDER holds photographs or clips, in a folder images or directly, or a data set with cameras; or it is a clip. If
     it was stopped, the same command goes on. It prints what it decides; a key overrules it, such as dataset.width=800.
+    With --cfg job it prints that only, and does nothing.
 
     Args:
         folder: folder of the photographs, or a clip.
@@ -46,16 +51,8 @@ def photos(folder: Path, settings: PhotosConfig, others: Sequence[str] = ()) -> 
     Raises:
         CTMError: there are no photographs, cameras cannot be found, nothing can be written, or training refuses them.
     """
-    if moved := next((other for other in others if other.startswith("hydra.run.dir=")), None):
-        raise ConfigError("hydra.run.dir", moved.partition("=")[2], f"none: it writes into {RUNS}/ where it is started")
-    root = root_of(folder)
-    if root == folder:
-        require_folder(folder, "a folder with photographs or clips, or a clip")
-    run = run_folder(root, settings.again)
-    check_writable(run)
-    more = [] if (run / CONFIG).exists() or not root.is_dir() else added(root, DEFAULT_FOLDER)
-    searching = bool(more) or not (layouts(root) or (run / METRICS).exists())
-    if searching:
+    root, run, why = begun(folder, settings, others)
+    if why:
         take_frames(folder, DEFAULT_FOLDER)
         develop_raws(root)
         for path in list_photographs(root, DEFAULT_FOLDER):
@@ -73,10 +70,9 @@ def photos(folder: Path, settings: PhotosConfig, others: Sequence[str] = ()) -> 
         console.print(text, soft_wrap=True, highlight=False, markup=False)
 
     with whole(parts(root, 60 * settings.minutes)):
-        if searching:
-            why = f"{len(more)} photographs were added since the search" if more else "none found"
+        if why:
             say(f"cameras: {why}; COLMAP searches for them in brightened copies")
-            tell(root, *place(root, CamerasConfig(overwrite=bool(more))))
+            tell(root, *place(root, CamerasConfig(overwrite=why != NO_CAMERAS)))
         if (run / PAGE).exists():
             say(f"{run} is finished: again=true trains again")
         elif (run / CONFIG).exists():
@@ -93,6 +89,54 @@ def photos(folder: Path, settings: PhotosConfig, others: Sequence[str] = ()) -> 
     say(f"lit views: {run / ALL}\nfilm:      {video}\nscores:    {run / METRICS}")
     print_file("all of it: ", run / PAGE)
     print_next("view", run)
+
+
+def dry_run(folder: Path, settings: PhotosConfig, others: Sequence[str] = ()) -> None:
+    """Print what :func:`photos` would do, its training as a command, and write nothing.
+
+    Args:
+        folder, settings, others: see :func:`photos`.
+
+    Raises:
+        CTMError: what is refused before cameras are searched, or by training.
+    """
+    root, run, why = begun(folder, settings, others)
+    if why:
+        files = [folder] if root != folder else below(home_of(root, DEFAULT_FOLDER))
+        kinds = {"photographs": PICTURE_SUFFIXES, "clips": CLIP_SUFFIXES}
+        counts = {kind: sum(path.suffix.lower() in suffixes for path in files) for kind, suffixes in kinds.items()}
+        if not any(counts.values()):
+            raise DataError(folder, "no photographs and no clips", "some")
+        there = " and ".join(f"{count} {kind}" for kind, count in counts.items() if count)
+        print(f"cameras: {why}; COLMAP would search for them in {there}")
+        print(f"then width and budget would be chosen for minutes={settings.minutes:g}")
+    elif (run / PAGE).exists():
+        print(f"{run} is finished: again=true trains again")
+        return
+    elif (run / CONFIG).exists():
+        print(f"it would go on with {run}, with its own settings")
+    else:
+        print(shlex.join(["ctm", *choices(root, settings.minutes, others, print), f"hydra.run.dir={run}"]))
+    print(f"then {run} would get lit views ({ALL}/), a film (video/) and {PAGE}")
+
+
+def begun(folder: Path, settings: PhotosConfig, others: Sequence[str]) -> tuple[Path, Path, str]:
+    """Find a capture's folder and its run, and why cameras are to be searched; empty where they are not.
+
+    Raises:
+        CTMError: there is no such folder, or no run can be written.
+    """
+    if moved := next((other for other in others if other.startswith("hydra.run.dir=")), None):
+        raise ConfigError("hydra.run.dir", moved.partition("=")[2], f"none: it writes into {RUNS}/ where it is started")
+    root = root_of(folder)
+    if root == folder:
+        require_folder(folder, "a folder with photographs or clips, or a clip")
+    run = run_folder(root, settings.again)
+    check_writable(run)
+    more = [] if (run / CONFIG).exists() or not root.is_dir() else added(root, DEFAULT_FOLDER)
+    if more:
+        return root, run, f"{len(more)} photographs were added since the search"
+    return root, run, "" if layouts(root) or (run / METRICS).exists() else NO_CAMERAS
 
 
 def check_writable(run: Path) -> None:

@@ -13,6 +13,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from ctm_plugin.backbones.posed import PosedBackbone
+from ctm_plugin.backbones.splat import Splat
 from ctm_plugin.color.light import AS_IS, Light, chosen_light
 from ctm_plugin.cpu.products import fast_products
 from ctm_plugin.data.readers.key_frames import read_key_frames
@@ -32,6 +33,9 @@ BT709_TAGS = ":".join(f"{key}=bt709" for key in ("colorspace", "color_primaries"
 FFMPEG_BT709 = ["-vf", f"scale=out_color_matrix=bt709:out_range=tv,setparams={BT709_TAGS}", "-movflags", "+faststart"]
 """ffmpeg's arguments: BT.709's colours, tagged as such, and the index at the file's beginning."""
 
+FILM_WIDTH, MAX_SCALE = 1280, 2.0
+"""Width in pixels that films of splats reach, at most so many times the training's: there they are 0.05 dB closer to
+larger photographs than enlarged pictures are (RealX3D's MilkCookie, trained 300 pixels wide)."""
 MIN_PRINCIPAL = 0.9
 """Principal point's coordinate, as a share of the picture's middle, below which the picture lies on a larger canvas."""
 
@@ -39,9 +43,9 @@ MIN_PRINCIPAL = 0.9
 def render(run: Path, settings: VideoConfig) -> None:
     """Render a film of a run, lit where the scene is dark.
 
-    Frames have the test views' size, through a pinhole. ``path=FILE.json`` films a camera path that ``ctm view`` saved:
-    a spline through all key frames, with as many frames from each key frame to the next, in the light that they were
-    saved in unless ``light`` says otherwise.
+    Frames have the test views' size, of splats up to twice that and 1280 pixels wide, through a pinhole.
+    ``path=FILE.json`` films a camera path that ``ctm view`` saved: a spline through all key frames, with as many frames
+    from each key frame to the next, in the light that they were saved in unless ``light`` says otherwise.
 
     Raises:
         CTMError: the folder is no run, its checkpoint cannot be used, it is not of a scene with cameras, or a film is
@@ -69,7 +73,11 @@ def film(run: Path, settings: VideoConfig) -> Path:
     if lit:
         seen = f"light={math.log2(light.gain):g} contrast={light.contrast:g} saturation={light.saturation:g}"
         print(f"lit as {path} was saved: {seen}; light=auto finds it anew")
-    cameras = film_cameras(scene, keys or path, settings.frames)
+    width = scene.test.width
+    scale = max(min(FILM_WIDTH / width, MAX_SCALE), 1.0) if isinstance(module, Splat) else 1.0
+    if scale > 1:
+        print(f"film: {round(scale * width)} pixels wide, {scale:.2g} times the training's pictures")
+    cameras = film_cameras(scene, keys or path, settings.frames, scale)
     if not settings.overwrite:
         check_new([out])
     out.parent.mkdir(parents=True, exist_ok=True)
@@ -95,9 +103,9 @@ def check_new(files: Iterable[Path]) -> None:
             raise ConfigError("out", str(file), "a file that is not there yet, or overwrite=true")
 
 
-def film_cameras(scene: Scene, path: str | KeyFrames, frames: int) -> list[Views]:
-    """The cameras of a path, a view each, of the first test view's size: with its lens, or as a pinhole of the key
-    frames' field of view.
+def film_cameras(scene: Scene, path: str | KeyFrames, frames: int, scale: float = 1.0) -> list[Views]:
+    """The cameras of a path, a view each, of ``scale`` times the first test view's size: with its lens, or as a pinhole
+    of the key frames' field of view.
     """
     test = scene.test
     lens, distortion = test.intrinsics[:1], None if test.distortion is None else test.distortion[:1]
@@ -113,8 +121,9 @@ def film_cameras(scene: Scene, path: str | KeyFrames, frames: int) -> list[Views
     doubled = zip((test.width, test.height), (2 * lens[0, 2:]).tolist(), strict=True)
     wide, high = (round(twice) if twice < MIN_PRINCIPAL * side else side for side, twice in doubled)
     lenses = lens.expand(len(c2w), 4).split(1)
+    blank = test.images.new_zeros(1, round(scale * high), round(scale * wide), test.images.shape[-1])
     return [
-        Views(test.images[:1, :high, :wide], pose, lens, ("frame",), distortion=distortion)
+        Views(blank, pose, scale * lens, ("frame",), distortion=distortion)
         for pose, lens in zip(c2w.split(1), lenses, strict=True)
     ]
 

@@ -27,6 +27,8 @@ ctm [group=choice ...] [key=value ...]      one run
 ctm -m group=a,b key=range(3) ...           all combinations; sweep.resume=true goes on with a sweep
 ctm resume=RUN_DIR                          go on with a run; RUN_DIR may be last, the newest there is, everywhere
 ctm --cfg job [group=choice ...]            every key that a command line comes to, without running it
+ctm photos FOLDER --cfg job                 what that would do, without doing it
+eval "$(ctm -sc install=bash)"              the tab key completes; also zsh, and in fish: ctm -sc install=fish | source
 ctm VERB ...                                one of these; ctm VERB --help says more
 
 ctm is python -m ctm_plugin for short.
@@ -38,6 +40,10 @@ HYDRA_FLAGS = shlex.split("""-m --multirun -r --run -c --cfg -p --package --reso
 """Hydra's own flags, which may have a value after them."""
 BARE_FLAGS = shlex.split("-m --multirun -r --run -c --cfg -i --info")
 """Hydra's flags of which at most one may be given."""
+DRY_RUN = "--cfg", "-c"
+"""Hydra's flag for verbs with a dry run, with the value ``job``."""
+SHELLS = "bash", "zsh", "fish"
+"""Shells whose command lines Hydra completes."""
 
 
 class UsageError(CTMError):
@@ -56,6 +62,7 @@ class Verb(NamedTuple):
         others: ``module:dataclass`` whose keys are accepted too, unchecked; ``TRAINING``: the keys of a run.
         usual: choices of the run unless ``others`` give them.
         goes_on: whether the same command, given again, resumes where it was stopped.
+        dry_run: ``module:function`` for ``--cfg job``: prints what ``entry`` would do.
     """
 
     summary: str
@@ -65,12 +72,14 @@ class Verb(NamedTuple):
     others: str = ""
     usual: tuple[str, ...] = ()
     goes_on: bool = False
+    dry_run: str = ""
 
 
 VERBS = {
     "photos": Verb(
         "make lit views and a film of photographs or clips", "FOLDER", "ctm_plugin.runs.photos:photos",
         "ctm_plugin.runs.settings:PhotosConfig", TRAINING, ("dataset=colmap", "dataset.root=."), True,
+        "ctm_plugin.runs.photos:dry_run",
     ),
     "train": Verb("train one run, or with -m a sweep; the word train may be left out"),
     "resume": Verb(
@@ -171,6 +180,12 @@ def _run(name: str, verb: Verb, arguments: Sequence[str], check: Callable[[Seque
         if verb.others == TRAINING:
             print("All choices and keys of a run can be given too: see ctm --help.")
         return
+    entry = verb.entry
+    if verb.dry_run and (flag := next((each for each in DRY_RUN if each in arguments), None)):
+        at, entry = arguments.index(flag), verb.dry_run
+        if arguments[at + 1 : at + 2] != ["job"]:
+            raise UsageError(f"found {shlex.join(arguments[at : at + 2])}, expected {flag} job\n{usage}")
+        arguments = [*arguments[:at], *arguments[at + 2 :]]
     for flag in (argument for argument in arguments if argument.startswith("-")):
         key = flag.lstrip("-").partition("=")[0].replace("-", "_")
         types = {field.name: field.type for field in fields(kind)}
@@ -195,7 +210,7 @@ def _run(name: str, verb: Verb, arguments: Sequence[str], check: Callable[[Seque
         named = {other.lstrip("+").partition("=")[0] for other in others}
         check([*(each for each in verb.usual if each.partition("=")[0] not in named), *others])
     paths = _runs(words, verb) if verb.words.startswith("RUN") else map(Path, words)
-    function = load(verb.entry)
+    function = load(entry)
     function(*paths, **{key: given[key] for key in get_type_hints(function) if key in given})
 
 

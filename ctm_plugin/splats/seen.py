@@ -37,12 +37,13 @@ def times_seen(places: Float[Tensor, "n 3"], cameras: Sequence[Camera]) -> Int64
     return times
 
 
-def as_wide_as_pixels(gaussians: Gaussians, cameras: Sequence[Camera]) -> Gaussians:
-    """Widen Gaussians by 0.3 pixels squared of the nearest camera: ``s^2 + 0.3 (d / f)^2``, d depth, f focal length.
+def as_wide_as_pixels(gaussians: Gaussians, cameras: Sequence[Camera], share: float = 1.0) -> Gaussians:
+    """Widen Gaussians by 0.3 pixels squared of the nearest camera, times ``share``: ``s^2 + 0.3 share (d / f)^2``, d
+    depth, f focal length.
 
     Renderings with smaller pixels than the training pictures' then have no gaps.
     """
     centres = torch.stack([camera.centre for camera in cameras])
     pixels = torch.stack([1 / camera.lens[:2].mean() for camera in cameras])
     pixel = (torch.cdist(gaussians.means, centres) * pixels).amin(1, keepdim=True)
-    return gaussians._replace(scales=((2 * gaussians.scales).exp() + EPS2D * pixel.square()).log() / 2)
+    return gaussians._replace(scales=((2 * gaussians.scales).exp() + share * EPS2D * pixel.square()).log() / 2)

@@ -61,6 +61,7 @@ class Page:
         ask: Callable[[Look, Limit], None],
     ):
         self._client, self._subjects, self._views, self._ask, self.here = client, subjects, views, ask, views[0]
+        self._left = False
         self._scene, self._levels = next(iter(subjects.values())).scene, None
         self._marks = client.scene.add_frame("/marks", show_axes=False)
         changing = [*self._picture_controls(client.gui, tuple(subjects), light)]
@@ -171,6 +172,8 @@ class Page:
 
     def ask(self) -> None:
         """Request the picture of the present look, and show only the controls that apply to it."""
+        if self._left:
+            return
         two = self.beside.value != NOTHING
         self.legend.visible = self.kind.value == "depth"
         self.layout.visible, self.split.visible = two, two and self.layout.value == "slider"
@@ -182,6 +185,11 @@ class Page:
             # Cameras and boxes are drawn over the whole window, not over each half.
             self._marks.visible = len(look.sources) == 1 or look.layout == "slider"
             self._ask(look, self.limit)
+
+    def leave(self) -> None:
+        """Ask for nothing more: callbacks that viser has queued run after the client left, too."""
+        self._left = True
+        self.path.stop()
 
     def show(self, look: Look, picture: Float[Tensor, "h w 3"], seconds: float) -> None:
         """Set a painted picture as the page's background, and describe it in the page."""

@@ -99,6 +99,10 @@ class PathPanel:
             content = json.dumps(self.key_frames().content(), indent=2).encode()
             self._client.send_file_download(f"{self._name}.json", content, save_immediately=True)
 
+    def stop(self) -> None:
+        """End the film that plays."""
+        self._playing = False
+
     async def _play(self, play: bool) -> None:
         was, self._playing = self._playing, play and bool(self._keys)
         if was or not self._playing:

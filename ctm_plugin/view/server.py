@@ -95,7 +95,8 @@ class Viewer:
         page.ask()
 
     async def _forget(self, client: viser.ClientHandle) -> None:
-        self._pages.pop(client.client_id, None)
+        if page := self._pages.pop(client.client_id, None):
+            page.leave()
         self.painter.forget(client.client_id)
 
     def _show(self, client: int, look: Look, picture: Float[Tensor, "h w 3"], seconds: float) -> None:

@@ -8,6 +8,7 @@ from typing import Any
 import ddp_rank
 import pytest
 import torch
+import torch.nn.functional as F
 from faults import checkpoint, differences
 from forked import Command
 from torch import Tensor
@@ -24,7 +25,7 @@ from ctm_plugin.runs.evaluate import evaluate
 from ctm_plugin.runs.load import load_posed
 from ctm_plugin.runs.rundir import LAST
 from ctm_plugin.runs.train import resume, train
-from ctm_plugin.scene.views import Scene
+from ctm_plugin.scene.views import Scene, Views
 from ctm_plugin.splats import scales
 from ctm_plugin.splats.gaussians import Gaussians
 from ctm_plugin.splats.growth import Change
@@ -52,6 +53,26 @@ def stepped(module: Splat) -> dict[str, Tensor]:
     module.training_step(None, 0)["loss"].backward()
     module.on_after_backward()
     return module.terms
+
+
+def test_pictures_with_more_pixels_have_no_gaps(scene, monkeypatch):
+    """Of specks far below a pixel, twice as wide pictures, averaged, are the pictures of the training's size."""
+    module, views = make(scene), scene.test
+    with torch.no_grad():
+        module.tables["scales"].fill_(math.log(1e-5))
+    blank = views.images.new_zeros(1, 2 * views.height, 2 * views.width, views.images.shape[-1])
+    finer = Views(blank, views.c2w[:1], 2 * views.intrinsics[:1], ("finer",))
+
+    def differs() -> float:
+        with torch.no_grad():
+            opacity = module.render_view(finer, 0)["opacity"][None, None]
+            expected = module.render_view(views, 0)["opacity"]
+        assert expected.max() > 0.05
+        return float((F.avg_pool2d(opacity, 2)[0, 0] - expected).abs().mean() / expected.mean())
+
+    assert differs() < 0.3  # a training view may be nearer, which wants less
+    monkeypatch.setattr(module, "_without_gaps", lambda camera: module.gaussians)
+    assert differs() > 0.5
 
 
 def gradients(module: Splat) -> dict[str, Tensor]:

@@ -1,6 +1,7 @@
 """One bar on a terminal, a line now and then elsewhere."""
 
 import io
+from types import SimpleNamespace
 
 import lightning as L
 import pytest
@@ -9,7 +10,6 @@ from toy import Clock, Toy, small_ctm, trainer
 
 from ctm_plugin.callbacks import progress
 from ctm_plugin.callbacks.progress import ProgressLine
-from ctm_plugin.settings.registry import COLOR_SPACES
 from ctm_plugin.show.bars import error_console
 
 
@@ -44,14 +44,18 @@ def test_accumulated_batches_are_one_step():
     assert "  8 rays/s" in line  # 20 batches of 8 rays in 20 seconds
 
 
-def test_what_was_fitted_is_told_at_the_start():
+def test_the_first_step_which_compiles_says_nothing_of_the_rest(monkeypatch):
+    """Nor does a slow stretch alone: it is the mean of all steps since."""
+    times = iter([0.0, 100.0, *(100.0 + step for step in (1, 2, 12, 13, 14, 15, 16, 17, 18))])
+    monkeypatch.setattr(progress, "time", SimpleNamespace(perf_counter=lambda: next(times)))
     out = io.StringIO()
     line = ProgressLine()
-    line.console = Console(file=out, width=200)
-    gain = COLOR_SPACES.get("gain")()
-    trainer(2, line).fit(Toy(2, gain))
-    first, *_ = out.getvalue().splitlines()
-    assert first == f"fitted to the scene's colours: gain {0.9 / float(gain.level):.3g}"
+    line.console, line.refresh = Console(file=out, width=200), 5.0
+    trainer(10, line).fit(Toy(10))
+    first, slow, *_ = out.getvalue().splitlines()
+    assert "ETA" not in first
+    assert slow.startswith("training 4/10")
+    assert slow.endswith("ETA 24 s")  # 6 steps of 12 s / 3
 
 
 def test_one_bar_on_a_terminal():

@@ -1,5 +1,6 @@
 """One command from photographs to lit views, on a hall that is dark."""
 
+import shlex
 import shutil
 import sys
 from pathlib import Path
@@ -72,6 +73,44 @@ def test_stopped_before_the_film_the_same_command_makes_it(capture, capsys, monk
     assert f"stopped; go on with: ctm photos '{capture}' again=true " in capsys.readouterr().err
     assert main(["photos", str(capture), "again=true", *SMALL]) == 0
     assert [path.name for path in Path("runs").iterdir()] == ["große Halle"]
+
+
+def test_a_dry_run_says_what_it_would_do_and_writes_nothing(capture, capsys, ctrl_c):
+    def tree() -> list[Path]:
+        return sorted(Path().rglob("*"))
+
+    before = tree()
+    assert main(["photos", str(capture), *SMALL, "--cfg", "job"]) == 0
+    said = capsys.readouterr().out.splitlines()
+    assert said[0].startswith("17 photographs, ")
+    assert said[-1] == "then runs/große Halle would get lit views (all/), a film (video/) and index.html"
+    assert tree() == before
+    ctrl_c(lambda step: step == 2)
+    assert main(shlex.split(said[-2])[1:]) == 130  # the command that it names is the one that photos runs
+    begun = tree()
+    assert main(["photos", str(capture), *SMALL, "--cfg", "job"]) == 0
+    assert capsys.readouterr().out.startswith("it would go on with runs/große Halle, with its own settings\n")
+    assert tree() == begun
+
+
+def test_a_dry_run_without_cameras(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "capture").mkdir()
+    (tmp_path / "capture" / "notes.txt").touch()
+    assert main(["photos", "capture", "--cfg", "job"]) == 1
+    assert "capture: found no photographs and no clips" in capsys.readouterr().err
+    for name in ("a.jpg", "b.HEIC", "c.mov"):
+        (tmp_path / "capture" / name).write_bytes(b"x")
+    assert main(["photos", "capture", "-c", "job", "minutes=3"]) == 0
+    assert capsys.readouterr().out.splitlines() == [
+        "cameras: none found; COLMAP would search for them in 2 photographs and 1 clips",
+        "then width and budget would be chosen for minutes=3",
+        "then runs/capture would get lit views (all/), a film (video/) and index.html",
+    ]
+    assert len(list((tmp_path / "capture").iterdir())) == 4
+    assert not Path("runs").exists()
+    assert main(["photos", "capture", "--cfg", "all"]) == 2
+    assert "found --cfg all, expected --cfg job" in capsys.readouterr().err
 
 
 def test_a_photograph_that_cannot_be_read_is_refused_before_anything_slow(tmp_path, monkeypatch, capsys):

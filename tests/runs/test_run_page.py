@@ -152,6 +152,9 @@ def test_in_a_browser(own):
         page.get_by_text("photograph, simply brightened").first.click()
         assert [page.locator(".compare .left").nth(n).is_visible() for n in (0, 1)] == [False, True]
         stage = page.locator("#walk")
+        page.set_viewport_size({"width": 700, "height": 300})
+        assert stage.bounding_box()["height"] <= 300  # all of it fits a window
+        page.set_viewport_size(size)
         stage.scroll_into_view_if_needed()
         page.get_by_role("button", name="Look around").click()
         box = stage.bounding_box()

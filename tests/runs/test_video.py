@@ -81,6 +81,9 @@ def test_a_film_has_the_middle_of_a_picture_that_is_smaller_than_the_others(run)
     cameras = film_cameras(replace(scene, test=replace(scene.test, intrinsics=upright)), "test", 1)
     assert (cameras[0].width, cameras[0].height) == (scene.test.width // 2, scene.test.height)
     assert (film_cameras(scene, "test", 1)[0].width) == scene.test.width
+    (wider, *_) = film_cameras(scene, "test", 1, 1.5)
+    assert (wider.width, wider.height) == (round(1.5 * scene.test.width), round(1.5 * scene.test.height))
+    assert torch.equal(wider.intrinsics, 1.5 * scene.test.intrinsics[:1])
 
 
 def test_one_ray_a_pixel(run):

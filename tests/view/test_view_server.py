@@ -56,6 +56,7 @@ def page(viewer):
     page = Page(client, viewer.subjects, viewer.views, viewer.light, lambda *what: asked.append(what))
     page.client, page.asked = client, asked
     yield page
+    page.leave()
     viewer.server.gui.reset()
     viewer.server.scene.reset()
 
@@ -94,6 +95,14 @@ def test_controls_make_the_look(page, viewer):
 def test_a_camera_that_is_none_asks_for_nothing(page):
     before = len(page.asked)
     page.client.camera.fov = float("nan")
+    page.ask()
+    assert len(page.asked) == before
+
+
+def test_a_client_that_left_asks_for_nothing(page, viewer):
+    page.leave()
+    viewer.server.gui.reset()  # its controls take no values any more
+    before = len(page.asked)
     page.ask()
     assert len(page.asked) == before
 
