@@ -264,7 +264,7 @@ class PosedBackbone(Backbone):
                 pictures["depth"] = depth_picture(view["depth"], scene.near, scene.far)
                 pictures["latent"] = latent_picture(view["latent"])
                 for kind, picture in pictures.items() if folder else ():
-                    write_png(folder / kind / f"{views.names[index]}.png", picture)
+                    write_png(folder / kind / f"{views.names[index]}.png", views.own(index, picture))
             result = summarize(
                 views.names,
                 rendered,

@@ -62,6 +62,7 @@ def develop_photographs(capture: Capture, config: BoundsConfig) -> tuple[Views, 
                 depth=develop_depth(depths, capture.depth_scale, *canvas) if depths and not noisy else None,
                 lit=None if noisy else develop_lit(taken, photo, own, canvas),
                 exposures=exposures_told([headers[i] for i in chosen]) if noisy else None,
+                sizes=torch.tensor(own) if {*sizes} != {canvas} else None,
             )
         )
     train, test = views

@@ -107,7 +107,9 @@ def write_views(run: Path) -> None:
     every = [(views, index) for views in (scene.train, scene.test) for index in range(len(views))]
     with replacing_folder(run / ALL) as folder, fast_products(module.device):
         for views, index in tracked(every, ALL):
-            write_png(folder / f"{views.names[index]}.png", lit_view(module, views, index, posed.light))
+            write_png(
+                folder / f"{views.names[index]}.png", views.own(index, lit_view(module, views, index, posed.light))
+            )
 
 
 def write_lit(path: Path, module: Splat, light: Light) -> None:

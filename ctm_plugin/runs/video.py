@@ -32,9 +32,6 @@ BT709_TAGS = ":".join(f"{key}=bt709" for key in ("colorspace", "color_primaries"
 FFMPEG_BT709 = ["-vf", f"scale=out_color_matrix=bt709:out_range=tv,setparams={BT709_TAGS}", "-movflags", "+faststart"]
 """ffmpeg's arguments: BT.709's colours, tagged as such, and the index at the file's beginning."""
 
-MIN_PRINCIPAL = 0.9
-"""Share of the middle's coordinate below which a principal point is that of a smaller picture on a larger canvas."""
-
 
 def render(run: Path, settings: VideoConfig) -> None:
     """Render a film of a run, lit where the scene is dark.
@@ -110,8 +107,7 @@ def film_cameras(scene: Scene, path: str | KeyFrames, frames: int) -> list[Views
     else:
         paths = {"orbit": orbit, "capture": capture}
         c2w = paths[path](scene.train, frames) if path in paths else spiral(scene.train, scene.near, scene.far, frames)
-    doubled = zip((test.width, test.height), (2 * lens[0, 2:]).tolist(), strict=True)
-    wide, high = (round(twice) if twice < MIN_PRINCIPAL * side else side for side, twice in doubled)
+    high, wide = test.size(0)
     lenses = lens.expand(len(c2w), 4).split(1)
     return [
         Views(test.images[:1, :high, :wide], pose, lens, ("frame",), distortion=distortion)

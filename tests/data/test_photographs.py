@@ -201,12 +201,14 @@ def test_pictures_of_two_sizes(yard, tmp_path):
             height, width = (20, 12) if number in upright else (HEIGHT, WIDTH)
             stored = iio.imread(yard / "images" / NAMES[number])
             np.testing.assert_array_equal(views.images[index, :height, :width], stored)
+            assert views.own(index, views.images[index]).shape[:2] == views.size(index) == (height, width)
             assert views.mask[index, :height, :width].all()
             assert views.mask[index].sum() == height * width
             assert not views.images[index][~views.mask[index]].any()
     with pytest.warns(UserWarning, match="sizes"):
         half = load(yard, width=12)  # the widest one's
     index = half.train.names.index("f_01")
+    assert half.train.size(index) == (10, 6)
     assert half.train.mask[index].nonzero().amax(0).tolist() == [9, 5]
     torch.testing.assert_close(half.train.intrinsics, found.train.intrinsics / 2)
 

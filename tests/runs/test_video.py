@@ -76,9 +76,8 @@ def test_a_saved_path_is_lit_as_it_was_seen(run, tmp_path, capsys):
 def test_a_film_has_the_middle_of_a_picture_that_is_smaller_than_the_others(run):
     """Pictures of several sizes lie in the upper left corner of one canvas."""
     scene = load_posed(run).module.scene
-    upright = scene.test.intrinsics.clone()
-    upright[:, 2] *= 0.5
-    cameras = film_cameras(replace(scene, test=replace(scene.test, intrinsics=upright)), "test", 1)
+    upright = torch.tensor([[scene.test.height, scene.test.width // 2]] * len(scene.test))
+    cameras = film_cameras(replace(scene, test=replace(scene.test, sizes=upright)), "test", 1)
     assert (cameras[0].width, cameras[0].height) == (scene.test.width // 2, scene.test.height)
     assert (film_cameras(scene, "test", 1)[0].width) == scene.test.width
 
