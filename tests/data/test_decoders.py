@@ -181,6 +181,16 @@ def png_of(folder, levels, orientation):
     return folder / "a.png"
 
 
+@pytest.mark.parametrize(("mode", "alpha"), [("RGB;16", False), ("RGBA;16", True)])
+def test_a_heic_of_10_bits_keeps_them(tmp_path, mode, alpha):
+    levels = np.arange(8 * 8 * (3 + alpha), dtype=np.uint16).reshape(8, 8, -1) % 1024
+    lossless = {"quality": -1, "chroma": 444, "matrix_coefficients": 0}
+    pillow_heif.from_bytes(mode, (8, 8), (levels << 6).tobytes()).save(tmp_path / "a.heic", **lossless)
+    found = read_picture(tmp_path / "a.heic")
+    assert (found.header.deep, found.header.alpha) == (True, alpha)
+    np.testing.assert_allclose(found.image(), levels.astype(float) * 64 / 65535, atol=1e-6)
+
+
 def test_a_heic_of_other_colours_says_so(tmp_path):
     """PQ's curve is none of sRGB's; Display P3 by a profile is converted, as in a JPEG."""
     levels = np.full((16, 16, 3), (200, 60, 60), np.uint8)
