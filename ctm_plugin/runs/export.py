@@ -18,7 +18,7 @@ from ctm_plugin.errors import ConfigError
 from ctm_plugin.files import replacing, replacing_folder
 from ctm_plugin.metrics.precision import full_float32
 from ctm_plugin.runs.captures import Dots, write_capture
-from ctm_plugin.runs.load import load_posed
+from ctm_plugin.runs.load import LoadedRun, load_posed
 from ctm_plugin.runs.page import write_page
 from ctm_plugin.runs.rundir import ALL, PAGE
 from ctm_plugin.runs.settings import ExportConfig
@@ -61,7 +61,7 @@ def export(run: Path, settings: ExportConfig) -> None:
         place = (Path(settings.out) if settings.out else run) / PAGE
         if not settings.overwrite:
             check_new([place])
-        export_page(run, place, settings)
+        export_page(run, load_posed(run, settings.dataset.root, pictures=False), place, settings)
         print_file("written to ", place)
         return
     posed = load_posed(run, settings.dataset.root, pictures=settings.photographs)
@@ -94,15 +94,13 @@ def export(run: Path, settings: ExportConfig) -> None:
         print_next("view", run)
 
 
-def export_page(run: Path, path: Path, settings: ExportConfig) -> None:
+def export_page(run: Path, posed: LoadedRun, path: Path, settings: ExportConfig) -> None:
     """Write a run's page."""
-    posed = load_posed(run, settings.dataset.root, pictures=False)
     write_page(path, run, posed, chosen_light(settings, posed.light))
 
 
-def write_views(run: Path) -> None:
+def write_views(run: Path, posed: LoadedRun) -> None:
     """Write every photograph's view, lit: ``all/NAME.png``."""
-    posed = load_posed(run, pictures=False)
     module, scene = posed.module, posed.module.scene
     every = [(views, index) for views in (scene.train, scene.test) for index in range(len(views))]
     with replacing_folder(run / ALL) as folder, fast_products(module.device):

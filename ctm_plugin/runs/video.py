@@ -19,7 +19,7 @@ from ctm_plugin.data.readers.key_frames import read_key_frames
 from ctm_plugin.data.rig import SURROUND_DEGREES, turn
 from ctm_plugin.errors import ConfigError
 from ctm_plugin.files import replacing
-from ctm_plugin.runs.load import load_posed
+from ctm_plugin.runs.load import LoadedRun, load_posed
 from ctm_plugin.runs.settings import VideoConfig, can_mp4
 from ctm_plugin.scene.camera_paths import KeyFrames, capture, orbit, spiral
 from ctm_plugin.scene.views import Scene, Views
@@ -44,18 +44,17 @@ def render(run: Path, settings: VideoConfig) -> None:
         CTMError: the folder is no run, its checkpoint cannot be used, it is not of a scene with cameras, or a film is
             there already.
     """
-    out = film(run, settings)
+    out = film(run, load_posed(run, settings.dataset.root, pictures=False), settings)
     print(f"written to {out}")
     print_next("view", run)
 
 
-def film(run: Path, settings: VideoConfig) -> Path:
+def film(run: Path, posed: LoadedRun, settings: VideoConfig) -> Path:
     """Write a film, see :func:`render`.
 
     Returns:
         Its file.
     """
-    posed = load_posed(run, settings.dataset.root, pictures=False)
     module, scene = posed.module, posed.module.scene
     path = settings.path or ("orbit" if turn(scene.train.c2w.cpu().double().numpy()) >= SURROUND_DEGREES else "capture")
     ending = ".mp4" if can_mp4() else ".gif"
