@@ -9,10 +9,19 @@ from typing import Any
 
 import numpy as np
 import torch
+from jaxtyping import Float32
 from torch import Tensor
 
 from ctm_plugin.data.readers.folders import require_file, told
-from ctm_plugin.data.readers.picture import MAX_PIXELS, Opened, check_size, from_light, unpremultiplied, upright_header
+from ctm_plugin.data.readers.picture import (
+    MAX_PIXELS,
+    Lens,
+    Opened,
+    check_size,
+    from_light,
+    unpremultiplied,
+    upright_header,
+)
 from ctm_plugin.data.readers.profiles import as_srgb, foreign
 from ctm_plugin.errors import DataError
 
@@ -21,6 +30,8 @@ EXPECTED = (
     f"{MAX_PIXELS} pixels: copy it here again, or leave it out"
 )
 GREY, COLOUR = (("Y",), ("Y", "A")), (("R", "G", "B"), ("R", "G", "B", "A"))
+LENS_NAMES = ("Make", "Model", "Exif:FocalLength", "Exif:FocalLengthIn35mmFilm", "Exif:DigitalZoomRatio")
+"""OpenImageIO's names of what :class:`Lens` has."""
 WHOLE, LIGHT = ("uint8", "uint16"), ("half", "float", "double")
 """Types of numbers, as OpenImageIO calls them."""
 
@@ -55,6 +66,19 @@ def colored(pixels: np.ndarray) -> np.ndarray:
     return pixels if pixels.shape[-1] > 2 else pixels[..., [0, 0, 0, *range(1, pixels.shape[-1])]]
 
 
+def write_light(path: Path, light: Float32[np.ndarray, "h w 3"], orientation: int, lens: Lens) -> None:
+    """Write linear light as EXR of half floats, to be turned by EXIF's orientation; the lens by its EXIF's names."""
+    import OpenImageIO as oiio
+
+    spec = oiio.ImageSpec(light.shape[1], light.shape[0], 3, "half")
+    for name, value in (("Orientation", orientation), *zip(LENS_NAMES, lens, strict=True)):
+        if value is not None:
+            spec.attribute(name, value)
+    file = oiio.ImageOutput.create("openexr")
+    if file is None or not (file.open(str(path), spec) and file.write_image(light) and file.close()):
+        raise OSError(oiio.geterror() if file is None else file.geterror())
+
+
 @contextmanager
 def open_deep(path: Path) -> Iterator[Opened]:
     """A TIFF or an EXR. 16 bits, and 8 without an ICC profile, are taken for sRGB, floats for linear light."""
@@ -83,4 +107,5 @@ def open_deep(path: Path) -> Iterator[Opened]:
                 stored = unpremultiplied(stored)
             return from_light(stored, path) if light else torch.from_numpy(stored).clamp_(max=1.0)
 
-        yield Opened(header._replace(colours=foreign(profile, grey, deep, light)), pixels)
+        lens = Lens(*map(spec.getattribute, LENS_NAMES))
+        yield Opened(header._replace(colours=foreign(profile, grey, deep, light), lens=lens), pixels)
