@@ -21,6 +21,7 @@ from ctm_plugin.cameras.lenses import tell_lenses_apart
 from ctm_plugin.cameras.pairs import VOTERS, all_pairs, likely_pairs
 from ctm_plugin.cameras.refine import Light, blurred, refine
 from ctm_plugin.cameras.settings import MIN_PICTURES, CamerasConfig
+from ctm_plugin.cameras.sharpness import unsharp
 from ctm_plugin.cameras.trust import Trusted, trusted
 from ctm_plugin.color.light import LUMINANCE, brighten, factor_to_mean
 from ctm_plugin.color.srgb import linear_to_srgb, srgb_to_linear
@@ -76,15 +77,21 @@ def find_cameras(
     Details are searched first as usual, then, where they hold too little, pooled over sizes (J. Dong and S. Soatto,
     Domain-size pooling in local descriptors, CVPR 2015), then by a network, if it is installed: at once where too few
     pictures find their places. Of several models the one that most sights hold is taken, and refined. Details and
-    matches are kept in ``folder``: those that are there already are taken.
+    matches are kept in ``folder``: those that are there already are taken. Pictures far less sharp than their
+    neighbours are left out.
 
     Raises:
         DataError: too few pictures find a place, or too little holds them.
     """
     paths, headers, gain, best = [each.path for each in pictures], [each.header for each in pictures], 1.0, Trusted()
-    pairs = all_pairs(len(paths)) if len(paths) <= settings.all_pairs else []
     with ThreadPoolExecutor(None if settings.threads < 0 else settings.threads) as pool:
         lights = list(with_progress("brightness", pool.map(partial(read_light, size=settings.size), pictures), paths))
+        sensors = [(header.lens, *sorted(header[:2])) for header in headers]
+        if soft := unsharp([each.light.numpy() for each in lights], sensors):
+            say(f"{len(soft)} pictures far less sharp than their neighbours are left out, as {names[soft[0]]!r}")
+            kept = [number for number in range(len(names)) if number not in soft]
+            paths, headers, lights, names = ([each[i] for i in kept] for each in (paths, headers, lights, names))
+        pairs = all_pairs(len(paths)) if len(paths) <= settings.all_pairs else []
         if settings.brighten:
             gain = find_gain([as_grey(each.light[::THINNING, ::THINNING]) for each in lights])
         rungs = [SIFT, POOLED, LEARNED] if has_network() else [SIFT, POOLED]
