@@ -18,7 +18,7 @@ pictures were averaged over 9 columns, 0.4 and 0.6 in two that noise or smooth t
 def unsharp(lights: Sequence[Float32[np.ndarray, "h w"]], sensors: Sequence[Hashable]) -> list[int]:
     """Numbers of pictures whose sharpness is below ``LEAST_SHARE`` of the median of their neighbours'.
 
-    Sharpness is ``var L`` and ``var L / mean^2`` of the light, with ``L`` its Laplacian; both must be below: one alone
+    Sharpness is ``var L`` and ``var L / mean^2`` of the light, with ``L`` its Laplacian; both must be below: one
     is so in less light, or next to pictures whose noise is larger.
 
     Args:

@@ -134,8 +134,15 @@ def camera_of(photograph: Photograph, header: Header, source: Path, crop: tuple[
 
 
 def exposures_told(headers: Sequence[Header]) -> Float32[Tensor, " n"] | None:
-    """The light ``[N]`` that pictures took by their EXIF; NaN where it does not tell, ``None`` where none does."""
+    """The light ``[N]`` that pictures took by their EXIF; NaN where it does not tell, ``None`` where none does.
+
+    Of several cameras, whose own factors differ, it is relative to the median of each one's pictures.
+    """
     exposures = torch.tensor([math.nan if header.exposure is None else header.exposure for header in headers])
+    cameras = [header.lens[:2] for header in headers]
+    for camera in {*cameras} if len({*cameras}) > 1 else ():
+        own = torch.tensor([each == camera for each in cameras])
+        exposures[own] /= exposures[own].nanmedian()
     return None if exposures.isnan().all() else exposures
 
 

@@ -228,6 +228,18 @@ def test_exposures_of_training_pictures(yard):
     assert scene.test.exposures is None
 
 
+def test_exposures_of_two_cameras_are_compared_with_their_own(yard):
+    for index, name in enumerate(NAMES):
+        exif = Image.Exif()
+        exif[ExifTags.Base.Orientation] = 1
+        exif[ExifTags.Base.Model] = ("one", "other")[index % 2]
+        exif.get_ifd(ExifTags.IFD.Exif)[ExifTags.Base.ExposureTime] = (0.5, 2.0)[index % 2] * (1 + (index == 3))
+        Image.fromarray(np.zeros((HEIGHT, WIDTH, 3), np.uint8)).save(yard / "images" / name, exif=exif)
+    scene = load(yard)
+    expected = torch.tensor([2.0 if name == "f_03" else 1.0 for name in scene.train.names])
+    torch.testing.assert_close(scene.train.exposures, expected)
+
+
 def masks(root: Path, names: list[str], size: tuple[int, int] = YARD_SIZE) -> np.ndarray:
     """Masks that take the left half out."""
     levels = np.zeros((size[1], size[0]), np.uint8)
