@@ -162,7 +162,7 @@ def shots_of(module: PosedBackbone, light: Light) -> tuple[list[PageView], tuple
         )
         for index, kinds in zip(chosen, files, strict=True)
     ]
-    return shots, views.size(0)[::-1]
+    return shots, views.size(views.largest)[::-1]
 
 
 def webp(picture: Image.Image, width: int) -> bytes:

@@ -92,11 +92,12 @@ def check_new(files: Iterable[Path]) -> None:
 
 
 def film_cameras(scene: Scene, path: str | KeyFrames, frames: int) -> list[Views]:
-    """The cameras of a path, a view each: with the first test view's lens and size, or a pinhole of the field of view
-    that key frames say.
+    """The cameras of a path, a view each: with lens and size of the largest test view, the first of several, or a
+    pinhole of the field of view that key frames say.
     """
-    test = scene.test
-    lens, distortion = test.intrinsics[:1], None if test.distortion is None else test.distortion[:1]
+    test, own = scene.test, scene.test.largest
+    lens = test.intrinsics[own : own + 1]
+    distortion = None if test.distortion is None else test.distortion[own : own + 1]
     if isinstance(path, KeyFrames):
         c2w, fov = path.path(frames)
         focal, middle = test.height / (2 * (fov / 2).tan()), torch.tensor([test.width / 2, test.height / 2])
@@ -106,7 +107,7 @@ def film_cameras(scene: Scene, path: str | KeyFrames, frames: int) -> list[Views
     else:
         paths = {"orbit": orbit, "capture": capture}
         c2w = paths[path](scene.train, frames) if path in paths else spiral(scene.train, scene.near, scene.far, frames)
-    high, wide = test.size(0)
+    high, wide = test.size(own)
     lenses = lens.expand(len(c2w), 4).split(1)
     return [
         Views(test.images[:1, :high, :wide], pose, lens, ("frame",), distortion=distortion)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -80,6 +81,11 @@ class Views:
     def size(self, index: int) -> tuple[int, int]:
         """Height and width of a view's own picture."""
         return (self.height, self.width) if self.sizes is None else tuple(self.sizes[index].tolist())
+
+    @property
+    def largest(self) -> int:
+        """Number of the largest picture, the first of several."""
+        return max(range(len(self)), key=lambda index: math.prod(self.size(index)))
 
     def own(self, index: int, image: Tensor) -> Tensor:
         """The part of a view's image ``[H, W, ...]`` that its picture fills."""
