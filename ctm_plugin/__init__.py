@@ -1,6 +1,6 @@
 """Color Transform Module: learn, with the scene, the colour space in which a radiance field is trained.
 
-``import ctm_plugin as ctm`` brings :data:`FRONT`; torch is imported when one of them is asked for.
+``import ctm_plugin as ctm`` offers the names of :data:`FRONT`; torch is imported when one of them is used.
 """
 
 from importlib import import_module
@@ -8,7 +8,7 @@ from importlib import import_module
 __version__ = "0.10.0"
 FRONT = {"Auto": "color.auto", "CTM": "color.ctm", "AttachTransform": "callbacks.attach_ctm"}
 FRONT |= dict.fromkeys(("fit", "load_run", "losses", "transform"), "front")
-"""Names for other programs, and the modules that have them."""
+"""Public names of the package for other programs, and the module that defines each."""
 
 
 def __getattr__(name: str) -> object:

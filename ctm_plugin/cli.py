@@ -124,7 +124,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _run(arguments: list[str]) -> None:
-    """One verb; training where there is none."""
+    """Run the verb of a command line, or a training where there is none."""
     verb = "train"
     spaced = arguments[1:] and arguments[1].startswith("=")
     if arguments and arguments[0] and "=" not in arguments[0] and arguments[0][0] not in "-+~" and not spaced:
@@ -145,9 +145,9 @@ def _run(arguments: list[str]) -> None:
 
 
 def print_list(*groups: Path, others: Sequence[str] = ()) -> None:
-    """Every choice of every group, in a line each; the keys of groups that are named, as GROUP or GROUP=CHOICE.
+    """Print every choice of every group in a line each, or the keys of the groups given as GROUP or GROUP=CHOICE.
 
-    GROUP=CHOICE tells what the choice says of itself, too.
+    GROUP=CHOICE also prints the choice's description.
     """
     named = [*map(str, groups), *others]
     if not named:
@@ -199,7 +199,7 @@ def _train(arguments: Sequence[str]) -> None:
 
 
 def _searched(folder: str | None) -> list[str]:
-    """The override that has Hydra look for choices in this folder too."""
+    """The override that makes Hydra search ``folder`` for choices too; empty without one."""
     if folder is None:
         return []
     if not os.path.isdir(folder):
@@ -208,7 +208,7 @@ def _searched(folder: str | None) -> list[str]:
 
 
 def _print_one(own: Hydra, config: DictConfig, flags: Namespace) -> None:
-    """Print a configuration as Hydra does, but with what is left to the program."""
+    """Print a configuration as Hydra's ``--cfg`` does, but with the values that the program decides."""
     from ctm_plugin.runs.decide import decide
 
     decide(config)
@@ -269,7 +269,7 @@ def _resume(arguments: Sequence[str]) -> None:
 
 @contextmanager
 def _a_line_each() -> Iterator[None]:
-    """Warnings without the place in the code, each once; nothing of threads whose errors come here later."""
+    """Context that prints each warning once, in a line without its place in the code, and no errors of threads."""
     lines: set[str] = set()
     shown, failed = warnings.formatwarning, threading.excepthook
 

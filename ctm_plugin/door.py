@@ -1,6 +1,4 @@
-"""The one door to faster versions: a plain torch function, the loop that may run in its place on a CPU, and the kernel
-that may on a GPU.
-"""
+"""Dispatch of a plain torch function to faster versions of it: a numba loop on a CPU, a Triton kernel on a GPU."""
 
 from __future__ import annotations
 
@@ -16,7 +14,7 @@ import torch
 from torch import Tensor, nn
 
 registered: dict[str, Callable] = {}
-"""Every function with a loop or a kernel, by module and name. ``reference`` of it is plain torch; ``loop`` and
+"""Every function with a loop or a kernel, by module and name. Its ``reference`` is plain torch; its ``loop`` and
 ``kernel`` are names or ``None``."""
 
 
@@ -26,11 +24,11 @@ def looped(
     """Let a loop or a kernel run in a function's place, where :func:`may_run` or :func:`may_launch` its arguments,
     which are given by their places.
 
-    The function itself is plain torch: what other devices and types run, and what tests compare with.
+    The function itself is plain torch: other devices and types run it, and tests compare with it.
 
     Args:
         loop: ``module:name`` in the room ``cpu``, of the same arguments and results; imported when it is first wanted.
-        when: of the arguments, whether the loop is for them.
+        when: tells from the arguments whether the loop applies to them.
         kernel: ``module:name`` in the room ``gpu``, likewise. At first it is tried once on each device, see
             :mod:`ctm_plugin.gpu.trial`.
     """
@@ -60,13 +58,13 @@ def looped(
 
 
 def named(room: str, what: str) -> Callable:
-    """Import ``module:name`` of a room."""
+    """Import the function ``module:name`` of a room, ``cpu`` or ``gpu``."""
     module, name = what.split(":")
     return attrgetter(name)(importlib.import_module(f"{__package__}.{room}.{module}"))
 
 
 def may_run(arguments: Iterable[Any]) -> bool:
-    """Tell whether loops are for such arguments: all tensors of real numbers on the CPU, in float32. None are without
+    """Tell whether loops can take such arguments: tensors on the CPU, those of real numbers in float32. Never without
     numba or with ``NUMBA_DISABLE_JIT``.
     """
     real = (each for each in _tensors(arguments) if each.is_floating_point())
@@ -74,8 +72,8 @@ def may_run(arguments: Iterable[Any]) -> bool:
 
 
 def may_launch(arguments: Iterable[Any]) -> bool:
-    """Tell whether kernels are for such arguments: tensors on one GPU, those of real numbers in float32. None are
-    without Triton, or where torch has to give the same bits again: they add up in any order.
+    """Tell whether kernels can take such arguments: tensors on one GPU, those of real numbers in float32. Never
+    without Triton, or where torch must be deterministic: kernels add up in any order.
     """
     tensors = list(_tensors(arguments))
     on_one = len({each.device for each in tensors}) == 1 and tensors[0].device.type == "cuda"

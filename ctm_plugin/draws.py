@@ -1,4 +1,4 @@
-"""The random numbers of one training step, or of what else is drawn."""
+"""Random numbers of a training step, or of another stream, that depend only on seed and step."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class Draws:
         seed, step: any integers.
         device: where the numbers are wanted.
         rank, world: this process and how many there are.
-        stream: what they are for. Streams share no numbers; batches have the one without a name.
+        stream: name of the numbers' use. Streams share no numbers; training batches have the one without a name.
     """
 
     def __init__(
@@ -33,17 +33,17 @@ class Draws:
         self.rank, self.world = rank, world
 
     def uniform(self, rows: int, channels: int) -> Tensor:
-        """``[rows, channels]`` float32 from U[0, 1)."""
+        """Draw ``[rows, channels]`` float32 from U[0, 1)."""
         drawn = torch.rand(rows * self.world, channels, generator=self.generator, device=self.device)
         return drawn[self.rank * rows : (self.rank + 1) * rows]
 
     def normal(self, rows: int, channels: int) -> Tensor:
-        """``[rows, channels]`` float32 from N(0, 1)."""
+        """Draw ``[rows, channels]`` float32 from N(0, 1)."""
         drawn = torch.randn(rows * self.world, channels, generator=self.generator, device=self.device)
         return drawn[self.rank * rows : (self.rank + 1) * rows]
 
     def integers(self, high: int, rows: int) -> Tensor:
-        """``[rows]`` int64, uniform in 0..high-1, with replacement."""
+        """Draw ``[rows]`` int64, uniform in 0..high-1, with replacement."""
         drawn = torch.randint(high, (rows * self.world,), generator=self.generator, device=self.device)
         return drawn[self.rank * rows : (self.rank + 1) * rows]
 
@@ -55,17 +55,17 @@ class FixedDraws(Draws):
         self.number, self.device = number, torch.device(device)
 
     def uniform(self, rows: int, channels: int) -> Tensor:
-        """``[rows, channels]`` float32, all the same."""
+        """Give ``[rows, channels]`` float32, all equal to ``number``."""
         return torch.full((rows, channels), self.number, device=self.device)
 
     def normal(self, rows: int, channels: int) -> Tensor:
-        """``[rows, channels]`` float32 zeros."""
+        """Give ``[rows, channels]`` float32 zeros."""
         return torch.zeros(rows, channels, device=self.device)
 
 
 @contextmanager
 def seeded(seed: int) -> Iterator[None]:
-    """Initialise parameters from a seed of their own: two models that differ elsewhere start alike."""
+    """Context that seeds torch's generator, for parameters: two models that differ elsewhere start alike."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         yield

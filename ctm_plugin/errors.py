@@ -11,11 +11,11 @@ from pathlib import Path
 from typing import Any
 
 MAX_CHARACTERS = 600
-"""Most characters of a message's part: what was found may be a whole file."""
+"""Most characters of a value in a message: the value may be a whole file."""
 
 
 def printable(what: object) -> str:
-    """One line of text: control characters escaped, what is long cut in the middle."""
+    """Text of a value in one line: control characters escaped, long text cut in the middle."""
     text = "".join(each if each.isprintable() else each.encode("unicode_escape").decode() for each in str(what))
     return text if len(text) <= MAX_CHARACTERS else f"{text[: MAX_CHARACTERS // 2]}...{text[-MAX_CHARACTERS // 2 :]}"
 
@@ -25,7 +25,7 @@ class CTMError(Exception):
 
 
 class Words(str):
-    """What was found where that is no value: a message shows it without quotes."""
+    """Description of what was found, as against a value: a message shows it without quotes."""
 
     __repr__ = str.__str__
 
@@ -76,7 +76,7 @@ class Interrupted(CTMError):
     """A run was asked to stop; what it had is saved.
 
     Attributes:
-        when: what is said of where it stopped.
+        when: words for the point at which the run stopped.
         by: number of the signal that asked.
     """
 
@@ -87,7 +87,7 @@ class Interrupted(CTMError):
 
 @contextmanager
 def handling(handler: Callable[[int, Any], None], *numbers: int) -> Iterator[dict[int, Any]]:
-    """Have a handler called on signals in the block; it has those of before. Other threads than the main meet none."""
+    """Context that calls ``handler`` on signals; it gives the previous handlers. Only the main thread meets signals."""
     main = threading.current_thread() is threading.main_thread()
     before = {number: signal.signal(number, handler) for number in numbers} if main else {}
     try:

@@ -14,7 +14,7 @@ from typing import Any
 
 @contextmanager
 def naming(path: Path, *others: Path) -> Iterator[None]:
-    """Name a file in errors of the system that name none, as those of a full disk, or one of ``others``."""
+    """Context that names ``path`` in system errors that name no file, as of a full disk, or one of ``others``."""
     try:
         yield
     except OSError as error:
@@ -25,7 +25,7 @@ def naming(path: Path, *others: Path) -> Iterator[None]:
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """A path next to ``path`` to write to; it replaces ``path`` if the block ends well, else it is removed."""
+    """Context with a temporary path to write to; it replaces ``path`` if the block ends well, else it is removed."""
     beside = path.with_name(f".{path.name}.{os.getpid()}")
     try:
         with naming(path, beside):
@@ -39,7 +39,7 @@ def replacing(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def replacing_folder(path: Path) -> Iterator[Path]:
-    """A new folder next to ``path`` to fill; it takes ``path``'s place if the block ends well, and goes if it does not.
+    """Context with a new folder to fill; it replaces ``path`` if the block ends well, else it is removed.
 
     What was there stays until then; of a link the link is replaced. The folder above is made, and goes if it stays
     empty.
@@ -87,10 +87,10 @@ def check_zip(path: Path, max_bytes: int | None = None) -> None:
 
     Args:
         path: the file.
-        most: bytes that it may hold, unpacked; as many as the file has, where nothing should be packed.
+        max_bytes: most bytes of content, unpacked; by default the file's size, where nothing should be packed.
 
     Raises:
-        zipfile.BadZipFile: it is damaged, none, or holds more.
+        zipfile.BadZipFile: the file is damaged, no ZIP file, or holds more.
     """
     with zipfile.ZipFile(path) as archive:
         if sum(entry.file_size for entry in archive.infolist()) > (max_bytes or path.stat().st_size):

@@ -1,4 +1,4 @@
-"""What other programs use of this package: colour transforms for their own trainers, and runs."""
+"""The package's interface for other programs: colour transforms for their trainers, and finished runs."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from ctm_plugin.settings.listing import names
 from ctm_plugin.settings.registry import COLOR_SPACES
 
 KEY_PREFIXES = ("ctm.", "color_space.", "color_space=")
-"""Prefixes of a transform's keys."""
+"""Prefixes of the keys that :func:`transform` takes."""
 
 
 def transform(name: str = "auto", *keys: str, seed: int = 0) -> ColorTransform:
@@ -31,7 +31,7 @@ def transform(name: str = "auto", *keys: str, seed: int = 0) -> ColorTransform:
     Args:
         name: what the command line calls it: a choice of ``ctm`` (``auto``, ``on``, ``quick``), or a colour space.
         keys: settings of it, as on the command line: ``ctm.k=4``; ``color_space=NAME`` under a choice of ``ctm``.
-        seed: of its first weights.
+        seed: seed of the transform's initial weights.
 
     Raises:
         CTMError: on another name, or keys that cannot be used.
@@ -61,11 +61,11 @@ def fit(
     Args:
         transform: on the device of ``colors``.
         colors: sRGB in [0, 1], of training pixels, some ten thousand.
-        seed: of what is drawn from them.
+        seed: seed of the random colours drawn from ``colors``.
         optimizer: the transform's own, of one parameter group; ``None``: an Adam is made.
 
     Returns:
-        That, to be stepped with the field's; ``None`` if the transform has no parameters.
+        The transform's optimizer, to be stepped with the field's; ``None`` if the transform has no parameters.
 
     Raises:
         ConfigError: ``ctm.lr_decay`` is not 1.
@@ -93,8 +93,8 @@ def losses(
         transform: a fitted one.
         latent: rendered, in [0, 1].
         rgb: sRGB in [0, 1].
-        kind: of distance: ``mse`` (squared) or ``l1`` (absolute).
-        weight: on the terms that compare with training colours.
+        kind: kind of distance: ``mse`` (squared) or ``l1`` (absolute).
+        weight: factor on the terms that compare with training colours.
 
     Returns:
         Terms by name, ``[]`` each. A training minimises their sum.

@@ -21,7 +21,11 @@ import time
 
 AVX2 = "+avx,+avx2,+bmi,+bmi2,+cx16,+f16c,+fma,+fxsr,+lzcnt,+mmx,+movbe,+popcnt,+sse,+sse2,+sse3,+sse4.1,+sse4.2,+ssse3"
 SETTINGS = {
-    "torch without vectors": {"ATEN_CPU_CAPABILITY": "default"},
+    "for any processor": {
+        "ATEN_CPU_CAPABILITY": "default",
+        "MKL_CBWR": "COMPATIBLE",
+        "NUMBA_CPU_NAME": "generic",
+    },
     "all for AVX2": {
         "ATEN_CPU_CAPABILITY": "avx2",
         "ONEDNN_MAX_CPU_ISA": "AVX2",
@@ -29,12 +33,11 @@ SETTINGS = {
         "NUMBA_CPU_NAME": "haswell",
         "NUMBA_CPU_FEATURES": AVX2,
     },
-    "MKL alike on all processors": {"MKL_CBWR": "COMPATIBLE"},
-    "numba for any processor": {"NUMBA_CPU_NAME": "generic"},
     "two threads": {"OMP_NUM_THREADS": "2"},
     "sums in another order": {"CTM_REORDERED": "1"},
 }
-"""One thread where nothing else is said. MKL looks at neither torch's nor oneDNN's setting."""
+"""One thread where nothing else is said. MKL looks at neither torch's nor oneDNN's setting. Libraries that do not look
+at one another's settings share one run; where it fails, each alone tells whose it is."""
 
 ROOMS = ("appearance", "backbones", "color", "cpu", "metrics", "optim", "rays", "scene", "splats")
 OF_DATA = ("degrade", "develop", "geometry", "lit", "near_far", "planar", "resample")
@@ -66,8 +69,7 @@ def run(name: str, more: list[str]) -> int:
     told = " ".join(f"{key}={value}" for key, value in setting.items())
     print(f"\n=== {name}: {told}", flush=True)
     begun, busy = time.monotonic(), busy_seconds()
-    # Without the types' checks: they are the same on any processor, and take a third of the time.
-    command = [sys.executable, "-m", "pytest", "-q", "-o", "addopts=-ra --strict-markers", "-n", "2", *NUMERICAL]
+    command = [sys.executable, "-m", "pytest", "-q", "-n", "2", *NUMERICAL]
     command += TRAINING if "CTM_REORDERED" in setting else [f"--deselect={test}" for test in LEFT_OUT]
     command += more
     code = subprocess.run(command, env=environment | setting).returncode

@@ -11,7 +11,7 @@ import runpy
 import shlex
 import subprocess
 import tomllib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import wraps
 from pathlib import Path
 from typing import NamedTuple
@@ -192,7 +192,12 @@ def begun(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[str]:
 CHOICES = [(group, choice) for group in GROUPS for choice in listing.choices(conf_dir(), group)]
 
 
-@pytest.mark.parametrize(("group", "choice"), CHOICES)
+def slow(values: Iterable, of: Callable[..., bool]) -> list:
+    """The values as parameters, those of a kind marked as slow."""
+    return [pytest.param(*each, marks=[pytest.mark.slow] * of(*each)) for each in values]
+
+
+@pytest.mark.parametrize(("group", "choice"), slow(CHOICES, lambda group, _: group == "experiment"))
 def test_choice(group, choice, begun, composed):
     """With a folder where it needs one; a table's rows are a sweep."""
     path = conf_dir() / group / f"{choice}.yaml"
@@ -292,12 +297,15 @@ PROGRAMS: dict[str, Callable[[Sequence[str]], object]] = {
     "tensorboard": lambda words: TensorBoard().configure(["tensorboard", *words]),
     "torchrun": lambda words: ctm(words[words.index("ctm_plugin") + 1 :]),
 }
+FIRST_PAGES = ("README.md", "photographs.md")
+"""Pages whose commands are typed by each ``make test``."""
 TYPED_COMMANDS = {command.words: command for page in reversed(TYPED) for command in commands(page)}
 
 
-@pytest.mark.parametrize(
-    "command", [each for words, each in TYPED_COMMANDS.items() if words[0] not in OF_OTHERS], ids=str
-)
+PAGE_COMMANDS = [(each,) for words, each in TYPED_COMMANDS.items() if words[0] not in OF_OTHERS]
+
+
+@pytest.mark.parametrize("command", slow(PAGE_COMMANDS, lambda each: each.page.name not in FIRST_PAGES), ids=str)
 def test_command(command, begun):
     program, *words = command.words
     PROGRAMS[program.removeprefix(".venv/bin/")](words)

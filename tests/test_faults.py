@@ -104,6 +104,7 @@ def test_a_full_disk(config, whole, tmp_path, monkeypatch, capsys):
     assert differences(run, whole) == []
 
 
+@pytest.mark.slow
 def test_a_second_process_is_refused(finished):
     with locked(finished):
         second = Command(f"resume={finished}", told=finished.with_name("told"))

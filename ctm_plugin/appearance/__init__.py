@@ -1,1 +1,1 @@
-"""How each photograph shows the one field: its exposure, its white balance, what its camera did from place to place."""
+"""Appearances: what makes photographs of one field differ, such as exposure and white balance."""

@@ -1,4 +1,4 @@
-"""One exposure a picture; and what all appearances are: parameters of pictures, on linear light."""
+"""One exposure a picture; the base of all appearances: parameters of each picture that act on linear light."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ class PixelPlaces(NamedTuple):
     """Places of R pixels in training pictures, and the colours rendered there."""
 
     view: Int[Tensor, " r"]
-    """The number of the training picture."""
+    """Index of each pixel's training picture."""
     at: Float[Tensor, "r 2"]
-    """x to the right and y down, from 0 to 1 across the picture."""
+    """Position in the picture: x to the right and y down, each from 0 to 1."""
     rendered: Float[Tensor, "r 3"]
-    """sRGB that the field has there, without gradient."""
+    """sRGB that the field renders at the pixel, without gradient."""
 
 
 class Exposure(nn.Module):
@@ -61,42 +61,42 @@ class Exposure(nn.Module):
         return self.log_gain - self.log_gain.mean()
 
     def forward(self, light: Float[Tensor, "r 3"], place: PixelPlaces) -> Float[Tensor, "r 3"]:
-        """Linear light of the field as the pictures recorded it, before it is clipped."""
+        """Apply the appearance: the field's linear light as the pictures recorded it, before clipping."""
         return light * self.log_gains().exp().index_select(0, place.view)[:, None]
 
     def undone(self, light: Float[Tensor, "r 3"], place: PixelPlaces) -> Float[Tensor, "r 3"]:
-        """Linear light of the pictures as the field has it: the inverse."""
+        """Undo the appearance: the pictures' linear light as the field has it."""
         return light / self.log_gains().exp().index_select(0, place.view)[:, None]
 
     def regularisers(self) -> dict[str, Tensor]:
-        """Weighted loss terms by name, ``[]`` each, that keep it from more than it is for."""
+        """Weighted loss terms by name, ``[]`` each, that regularise the appearance's parameters."""
         return {}
 
     def optimizer(self, steps: int) -> tuple[Optimizer, Schedule] | None:
-        """Its own, for so many steps; ``None``: nothing is learned."""
+        """The appearance's optimizer and its schedule over ``steps``; ``None``: nothing is learned."""
         groups = self.groups()
         return (Adam(groups), exponential(self.config.lr_decay, steps)) if groups else None
 
     def groups(self) -> list[dict]:
-        """Adam's groups, each with its name and rate."""
+        """Adam's parameter groups of the appearance, each with its name and learning rate."""
         return [] if self.config.fixed else [{"params": [self.log_gain], "lr": self.config.lr, "name": "exposure"}]
 
     @torch.no_grad()
     def describe(self) -> str:
-        """What was found, in a few words for people."""
+        """Summary of the learned appearance in a few words, for messages."""
         low, high = (self.log_gains() / math.log(2)).aminmax()
         return f"exposures from {low:+.2f} to {high:+.2f} stops"
 
 
 def log_exposures(start: str, views: Views) -> Float[Tensor, " n"]:
-    """Natural logarithms of the pictures' exposures, but for what they have in common.
+    """Natural logarithms of the pictures' exposures, up to one common offset.
 
     Args:
         start: one of :data:`STARTS`; ``light`` takes the mean linear light of all pixels that count.
         views: the pictures.
 
     Raises:
-        ConfigError: EXIF does not tell all of them.
+        ConfigError: a picture's EXIF gives no exposure.
     """
     if start == "same":
         return torch.zeros(len(views))

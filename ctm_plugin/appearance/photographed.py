@@ -1,4 +1,4 @@
-"""Between a field and its loss: what is rendered, as each picture shows it."""
+"""Renderings of a field as each photograph shows them, under its appearance, for the loss."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def exposed(appearance: Exposure, rgb: Float[Tensor, "r 3"], place: PixelPlaces)
 def photographed(
     appearance: Exposure, transform: ColorTransform, latent: Float[Tensor, "r k"], place: PixelPlaces
 ) -> Float[Tensor, "r k"]:
-    """A rendering as the pictures show it, in the transform's space: ``F + f(A(g(F))) - f(g(F))``.
+    """Apply the appearance to a rendering F, in the transform's space: ``F + f(A(g(F))) - f(g(F))``.
 
     f encodes, g decodes, A is :func:`exposed`. Where g inverts f exactly it is ``f(A(g(F)))``; where it does not, as
     with a learned transform, a picture whose appearance is the identity has F itself all the same.

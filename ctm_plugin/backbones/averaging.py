@@ -16,16 +16,16 @@ WINDOWS = 8
 
 
 def share(count: int, latest: int) -> float:
-    """Weight of the parameters in the mean at its update number ``count``: ``max(4 / latest, 9 / (10 + count))``, which
-    soon forgets the beginning."""
+    """Weight of the present parameters in the running mean at update ``count``: ``max(4 / latest, 9 / (10 + count))``.
+    The mean soon forgets the first ones."""
     return max(min(1.0, STEPS_BETWEEN / latest), 9 / (10 + count))
 
 
 @torch.no_grad()
 def follow(mean: nn.Module, trained: nn.Module, share: float) -> None:
-    """Let the mean go a share of the way to what is trained; buffers are copied.
+    """Move the mean parameters a share of the way to the trained ones, in place; buffers are copied.
 
-    torch's ``AveragedModel`` counts its looks on the device, which would make a GPU wait in each.
+    torch's ``AveragedModel`` counts its updates on the device, which would make a GPU wait in each.
     """
     for average, parameter in zip(mean.parameters(), trained.parameters(), strict=True):
         average.lerp_(parameter, share)
@@ -34,7 +34,7 @@ def follow(mean: nn.Module, trained: nn.Module, share: float) -> None:
 
 
 class Averaging:
-    """Gives a backbone the mean of its ``field`` over ``config.averaged`` latest steps, 0 for none: ``mean_field``."""
+    """Mixin: gives a backbone ``mean_field``, the mean of its ``field`` over the ``config.averaged`` latest steps."""
 
     field: nn.Module
     mean_field: nn.Module | None
@@ -43,7 +43,7 @@ class Averaging:
 
     @property
     def pictured_field(self) -> nn.Module:
-        """The field that pictures are made with: its mean in evaluation, where there is one."""
+        """The field that pictures are rendered with: in evaluation the mean field, where there is one."""
         return self.field if self.training or self.mean_field is None else self.mean_field
 
     def on_train_batch_start(self, batch: Any, batch_idx: int) -> None:
@@ -52,7 +52,7 @@ class Averaging:
             self.average(self.global_step)
 
     def average(self, step: int) -> None:
-        """Take the parameters before a step into their mean, if it is one of the looks."""
+        """Update the mean with the field's parameters before ``step``, if the mean is due for an update."""
         averaged = self.config.averaged
         count, rest = divmod(step - max(self.settled, self.total_steps - WINDOWS * averaged), STEPS_BETWEEN)
         if count < 0 or rest:
@@ -63,11 +63,11 @@ class Averaging:
             follow(self.mean_field, self.field, share(count, averaged))
 
     def copy_field(self) -> None:
-        """Begin with a mean of the field as it is."""
+        """Start the mean as a copy of the present field."""
         self.mean_field = deepcopy(self.field).requires_grad_(False)
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Make room for the mean, where the checkpoint has one; the field must have its size already."""
+        """Make a mean field to load the checkpoint's into, if it has one; the field must have its final sizes."""
         super().on_load_checkpoint(checkpoint)
         self.mean_field = None
         if any(key.startswith("mean_field.") for key in checkpoint["state_dict"]):

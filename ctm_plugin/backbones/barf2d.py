@@ -38,7 +38,7 @@ EVAL_CHUNK = 1 << 16
 
 @dataclass
 class PixelBatch(Batch):
-    """Pixels of the patches with their colours.
+    """A training batch of BARF-2D: pixels of its five patches with their colours.
 
     Attributes:
         pixel: ``[5, R / 5]``, flat index within each patch; ``None``: all, in order.
@@ -88,7 +88,7 @@ class BARF2D(Backbone):
 
     @property
     def warps(self) -> Tensor:
-        """Give the parameters ``[5, 8]`` of the homographies, the first 0."""
+        """Give the parameters ``[5, 8]`` of the patches' homographies; those of the first patch are 0."""
         moved = self.moved
         if self.progress < self.config.shifts_until:  # what has no gradient rests where it began
             moved = torch.cat([moved[:, :TRANSLATION], moved[:, TRANSLATION:].detach()], dim=1)
@@ -117,12 +117,12 @@ class BARF2D(Backbone):
         return Rendering((self.latent_at(self.moved_points(points).flatten(0, 1)),))
 
     def moved_points(self, points: Tensor) -> Tensor:
-        """Move points ``[N, 2]`` or ``[5, N, 2]`` of the patches to where they are in the picture: ``[5, N, 2]``."""
+        """Map points ``[N, 2]`` or ``[5, N, 2]`` of the patches into the picture by the homographies: ``[5, N, 2]``."""
         with torch.autocast(points.device.type, enabled=False):
             return warp(points, sl3_exp(self.warps))
 
     def latent_at(self, points: Tensor) -> Tensor:
-        """Evaluate the picture's latents ``[N, k]`` at ``[N, 2]``."""
+        """Evaluate the neural image's latents ``[N, k]`` at positions ``[N, 2]``."""
         config, shown = self.config, None
         if config.encoding == "barf":
             shown = shown_frequencies(config.frequencies, self.progress, config.start, config.end, points.device)
@@ -142,7 +142,7 @@ class BARF2D(Backbone):
 
     @torch.no_grad()
     def decay_warps(self) -> None:
-        """Draw all of the homographies but their shifts towards 0, ``h (1 - lr decay)``, while frequencies come in."""
+        """Decay all homography parameters but translations, ``h (1 - lr decay)``, while frequencies come in."""
         if self.progress < self.config.end:
             self.moved[:, TRANSLATION:] *= 1 - self.config.lr_warp * self.config.warp_decay
 
@@ -163,7 +163,7 @@ class BARF2D(Backbone):
         """Render latents ``[H, W, k]`` of the whole picture, in the first patch's frame, which is the picture's own.
 
         Args:
-            every: of rows and columns, the first one included.
+            every: render each ``every``-th row and column, the first ones included.
         """
         grid = pixel_grid(self.scene.height, self.scene.width)[::every, ::every]
         return self._rendered(grid.flatten(0, 1).to(self.device)).unflatten(0, grid.shape[:2])
@@ -230,7 +230,7 @@ class BARF2D(Backbone):
 
     @torch.no_grad()
     def film(self) -> Float[Tensor, "h w 3"]:
-        """Draw the outlines next to the fused picture, at half size, both lit."""
+        """Draw a frame of the training's film: patch outlines next to the fused picture, both lit, at half size."""
         every = max(2, self.stride(self.scene.height, self.scene.width))
         fused = self.light.apply(self.decode(self.render_image(every)).float().cpu())
         outlined = self._outlined(self.light)[::2, ::2]

@@ -36,7 +36,7 @@ from ctm_plugin.show.snapshot import Snapshot
 PREVIEW_WIDTH = 128
 """Largest width in pixels of a picture that is rendered while training."""
 PREVIEW_STEPS = 8
-"""Most pixels of such a picture, in multiples of ``batch_rays``: between pictures there are hundreds of steps."""
+"""Most pixels of a picture rendered while training, in multiples of ``batch_rays``: hundreds of steps lie between."""
 
 UNLIMITED_STEPS = 1 << 40
 """Step limit of a training that a clock ends."""
@@ -47,7 +47,7 @@ class Batch:
     """The input of a training step: the training colours. Subclasses add what else ``predict`` needs."""
 
     rgb: Tensor
-    """``[R, 3]`` in [0, 1]."""
+    """Training colours ``[R, 3]``, RGB in [0, 1]."""
 
 
 @dataclass
@@ -55,11 +55,11 @@ class Rendering:
     """What a backbone predicts for a batch: one or more latents of the same pixels, the best one last."""
 
     latents: tuple[Tensor, ...]
-    """``[R, k]`` each, in [0, 1]."""
+    """Latents of each rendering, ``[R, k]`` in [0, 1], the best one last."""
 
     @property
     def latent(self) -> Tensor:
-        """Give the best one, ``[R, k]``."""
+        """Give the latents ``[R, k]`` of the best rendering."""
         return self.latents[-1]
 
 
@@ -68,9 +68,9 @@ class Compared(NamedTuple):
 
     terms: dict[str, Tensor]
     target: Tensor
-    """``[R, k]``, detached."""
+    """The encoded training colours ``[R, k]``, detached."""
     rgb: Tensor
-    """``[R, 3]``."""
+    """The training colours ``[R, 3]`` in sRGB."""
 
 
 class Backbone(L.LightningModule):
@@ -82,31 +82,31 @@ class Backbone(L.LightningModule):
     ``appearance`` is what tells the training pictures apart, ``None`` where nothing does.
 
     Args:
-        transform: whose latents it renders; ``None``: the identity.
-        photometric: the distance between colours.
-        seed: of all random numbers of the training.
+        transform: the colour transform whose latents the field renders; ``None``: the identity.
+        photometric: the loss between two colours.
+        seed: seeds all random numbers of the training.
     """
 
     Config: type
-    """Its settings. Their class attribute ``default_dataset`` names the data set that a command line without
-    ``dataset=`` then has, where the usual one loads something else."""
+    """Dataclass of the backbone's settings. Its class attribute ``default_dataset`` names the data set of a command
+    line without ``dataset=``, where the usual one loads something else."""
     Scene: type = object
-    """What a data set must load for it to train on."""
+    """Type of scene that a data set must load for the backbone to train on."""
     batch_rays: int
     """Training pixels a batch, over all processes."""
     posed: bool = False
-    """Whether its ``scene`` is a :class:`~ctm_plugin.scene.views.Scene` that it renders from any camera, as a
+    """Whether the backbone renders its :class:`~ctm_plugin.scene.views.Scene` from any camera, as a
     :class:`~ctm_plugin.backbones.posed.PosedBackbone` does."""
     light: Light = AS_IS
-    """Light in which its pictures are displayed."""
+    """Light in which the backbone's pictures are displayed."""
     loops_only: bool = False
-    """Whether on a CPU loops do the work of its steps, so that torch's operators are as quick on one thread."""
+    """Whether numba loops do a training step's work on a CPU, so that torch's operators are as quick on one thread."""
     snapshots: Sequence[int] = (0,)
-    """Numbers of the test views that :meth:`snapshot` shows."""
+    """Indices of the test views that :meth:`snapshot` renders while training."""
     total_steps: int
     """Optimizer steps of a whole training."""
     pace: Pace | None = None
-    """Spread of its schedule over the steps, for backbones whose trainings may end earlier or later."""
+    """Map from training steps to places of the schedule, for backbones whose training may be stretched or cut."""
 
     def __init__(
         self, transform: ColorTransform | None = None, photometric: Photometric | None = None, seed: int = 0
@@ -126,11 +126,11 @@ class Backbone(L.LightningModule):
         raise NotImplementedError
 
     def scene_colors(self, draws: Draws, count: int) -> Tensor:
-        """``[count, 3]``: random training colours as evaluation shows them, for what is set before the field trains."""
+        """Draw random training colours ``[count, 3]``, as evaluation shows them, to fit the transform to."""
         raise NotImplementedError
 
     def some_colors(self) -> Tensor:
-        """``[SAMPLE_COLORS, 3]`` of them, the same each time."""
+        """Random training colours ``[SAMPLE_COLORS, 3]``, the same at each call."""
         return self.scene_colors(Draws(self.seed, 0, self.device, stream="colors"), SAMPLE_COLORS)
 
     def predict(self, batch: Batch, draws: Draws) -> Rendering:
@@ -144,24 +144,24 @@ class Backbone(L.LightningModule):
     def field_optimizers(self) -> dict[str, Optimizer]:
         """The optimizers of the backbone's own parameters, by name.
 
-        Those of ``transform`` and ``appearance`` are left out of ``self.parameters()`` here.
+        While this runs, ``self.parameters()`` leaves out those of ``transform`` and ``appearance``.
         """
         raise NotImplementedError
 
     def field_schedule(self) -> Schedule:
-        """Factor on their learning rates after so many optimizer steps."""
+        """Schedule of the field's optimizers: the factor on their learning rates after a number of steps."""
         return lambda step: 1.0
 
     def color_biases(self) -> list[Tensor]:
-        """``[k]`` each: biases of the last layers before the latents' sigmoid, to begin at the scene's mean colour."""
+        """Biases ``[k]`` before the latents' sigmoid, to be set so that the field begins at the scene's mean colour."""
         return []
 
     def stats(self) -> dict[str, float]:
-        """Numbers worth a curve, such as the occupied fraction of a grid."""
+        """Numbers by name to log as curves, such as the occupied fraction of a grid."""
         return {}
 
     def scores(self, folder: Path | None, scoring: Scoring) -> dict[str, Any]:
-        """Scores of the trained backbone, for ``metrics.json``, and its pictures in ``folder``, where there is one.
+        """Score the trained backbone for ``metrics.json``; write its test pictures to ``folder``, if that is given.
 
         ``psnr`` is what sweeps that search maximise, ``converged`` false prints "not converged", runs without the same
         ``protocol`` do not share a table.
@@ -173,36 +173,36 @@ class Backbone(L.LightningModule):
         return Snapshot()
 
     def film(self) -> Float[Tensor, "h w 3"] | None:
-        """A picture of the training, some twenty of which become a film; ``None``: there is none."""
+        """Render one frame of the training's film, which has some twenty; ``None``: the backbone has no film."""
         return None
 
     def cost(self, first: int | float, last: int | float) -> float:
-        """How long a step takes from a place of its schedule to another, on average, relative to others of it."""
+        """Mean duration of a training step between two places of the schedule, relative to its other parts."""
         return 1.0
 
     def rays(self, first: int, last: int) -> int | float:
-        """How many training pixels optimizer steps from one to another look at, a batch each, over all processes."""
+        """Number of training pixels that optimizer steps ``first`` to ``last`` use, over all processes."""
         return (last - first) * self.batch_rays
 
     # What it gets.
 
     @property
     def channels(self) -> int:
-        """How many numbers k it renders in place of a colour."""
+        """Number k of latent channels that the backbone renders in place of a colour."""
         return self.transform.channels
 
     def compare(self, batch: Batch, latents: list[Tensor], uniform: Uniform) -> Compared:
-        """Hold renderings ``[R, k]`` of a batch against its training colours."""
+        """Compare renderings ``[R, k]`` of a batch with its training colours by the transform's losses."""
         return Compared(*self.transform.losses(latents, batch.rgb, self.photometric, uniform), batch.rgb)
 
     @property
     def schedule_steps(self) -> int:
-        """Steps of its schedule: those of a whole training, unless time stretches or cuts it."""
+        """Number of steps of the schedule: those of a training, unless a time limit stretches or cuts it."""
         return self.total_steps if self.pace is None else self.pace.planned
 
     @property
     def scheduled(self) -> int | float:
-        """Where in its schedule it is, in steps of it."""
+        """Place of the training in its schedule, in steps of the schedule."""
         return self.global_step if self.pace is None else self.pace.place(self.global_step)
 
     @property
@@ -211,12 +211,12 @@ class Backbone(L.LightningModule):
         return self.batches_seen % self.trainer.accumulate_grad_batches == 0
 
     def stride(self, height: int, width: int) -> int:
-        """Rows and columns from one rendered pixel to the next, of pictures that are rendered while training."""
+        """Spacing of the pixels, in rows and columns, that are rendered of a picture of this size while training."""
         return math.ceil(max(width / PREVIEW_WIDTH, (width * height / (PREVIEW_STEPS * self.batch_rays)) ** 0.5))
 
     @torch.no_grad()
     def decode(self, latent: Tensor) -> Tensor:
-        """Latents to RGB in [0, 1], for people and metrics."""
+        """Decode latents ``[..., k]`` to RGB ``[..., 3]`` in [0, 1], for display and metrics."""
         return self.transform.decode(latent.float()).clamp(0, 1)
 
     def draws(self, step: int) -> Draws:
@@ -253,7 +253,7 @@ class Backbone(L.LightningModule):
         return NamedOptimizers(members, schedules)
 
     def _not_the_fields(self) -> set[Tensor]:
-        """Parameters with optimizers of their own."""
+        """Parameters of the transform and the appearance, which have optimizers of their own."""
         return {
             parameter
             for part in (self.transform, self.appearance)
@@ -288,13 +288,13 @@ class Backbone(L.LightningModule):
         self.named_optimizers.set_rates(self.scheduled)
 
     def validation_step(self, view: Tensor | int, batch_idx: int) -> Snapshot:
-        """Look at a test view; ``val/psnr`` and the like are what :meth:`snapshot` scores."""
+        """Render a test view, small; log the scores of :meth:`snapshot` as ``val/psnr`` and the like."""
         seen = snapshot(self, int(view))
         self.log_dict({f"val/{name}": value for name, value in seen.scores.items()}, batch_size=1, sync_dist=True)
         return seen
 
     def test_step(self, batch: Any, batch_idx: int) -> None:
-        """Score all test views as they are: ``test/psnr`` and the like are what :meth:`scores` finds."""
+        """Render all test views at full size; log the metrics of :meth:`scores` as ``test/psnr`` and the like."""
         scores = {name: value for name, value in self.scores(None, Scoring()).items() if name in METRICS}
         scores = {f"test/{name}": value for name, value in scores.items() if value is not None}
         self.log_dict(scores, batch_size=1, sync_dist=True)
@@ -304,7 +304,7 @@ class Backbone(L.LightningModule):
         return DataLoader(self.snapshots, batch_size=None, generator=torch.Generator())
 
     def test_dataloader(self) -> DataLoader:
-        """All test views at once."""
+        """One item: :meth:`test_step` scores all test views at once."""
         return DataLoader(range(1), batch_size=None)
 
     def train_dataloader(self) -> DataLoader:

@@ -44,7 +44,7 @@ class DVGO(OccupiedBackbone):
 
     Args:
         config: sizes, steps, rates.
-        scene: whose geometry is the configuration's.
+        scene: training and test views; its geometry must be the configuration's.
         transform, photometric, seed: see :class:`~ctm_plugin.backbones.radiance.RadianceBackbone`.
     """
 
@@ -88,8 +88,8 @@ class DVGO(OccupiedBackbone):
         return self.geometry == "bounded" and bool(self.config.coarse)
 
     def make_field(self, color: ViewMLP, box: Tensor | None = None, shape: Shape | None = None) -> VoxelField:
-        """The fresh field of the present stage over a box ``[2, 3]``, by default all that the cameras see; ``shape``
-        where it has grown already.
+        """Make a fresh field for the present stage over a box ``[2, 3]``, by default all that the cameras see;
+        ``shape``: vertices a side, where the grid has grown already.
         """
         coarse, config, space = self.stage == "coarse", self.config, space_of(self.scene, self.geometry, box)
         shape = shape or (cubic_shape(space.aabb, config.coarse_voxels) if coarse else self.grown_shape(space.aabb))
@@ -232,8 +232,8 @@ class DVGO(OccupiedBackbone):
         self._changed(self.config.restart)
 
     def _changed(self, restart: bool) -> None:
-        """Follow a field of another size; ``restart``: the field's optimizers and their schedules as for a stage that
-        begins, while the transform's go on.
+        """Renew the pixel pool and DDP for a field of another size; ``restart``: also the field's optimizers and their
+        schedules, while the transform's go on.
         """
         if restart:
             optimizers, schedule = self.named_optimizers, self.field_schedule()
@@ -261,7 +261,7 @@ class DVGO(OccupiedBackbone):
 
     @property
     def smooths(self) -> bool:
-        """Whether total variation is taken in this step."""
+        """Whether the present step adds the gradient of total variation."""
         some = self.stage == "fine" and (self.config.tv_density or self.config.tv_features)
         return bool(some) and (self.global_step - self.fine_start) % self.config.tv_every == 0
 

@@ -34,14 +34,14 @@ class HashField(OccupiedField):
     occupancy grid holds the largest alpha that a sample of a cell had lately.
 
     Args:
-        space: where it lives.
-        hash_grid: of features.
-        cells: of the occupancy, about.
-        channels: of the latent.
-        width: of the networks' hidden layers.
-        degrees: of the directions' harmonics.
+        space: the space that the field fills.
+        hash_grid: grid of the features.
+        cells: number of cells of the occupancy grid, about.
+        channels: number k of latent channels.
+        width: units of the networks' hidden layers.
+        degrees: degrees of the spherical harmonics of view directions.
         alpha_thre: see :class:`OccupiedField`.
-        free_below: cells with less alpha are free; the mean of all is, where that is less.
+        free_below: alpha below which cells are free, or the mean alpha of all cells where that is less.
     """
 
     def __init__(
@@ -70,7 +70,7 @@ class HashField(OccupiedField):
         return log_density(*self._looked_up(), self.space.unit(points))
 
     def reached(self, t: Tensor, ray_index: Tensor, points: Tensor, n_rays: int) -> tuple[Tensor, ...]:
-        """Samples ``[N]`` of M with alpha that light reaches, and their features: the others change next to nothing."""
+        """Indices ``[N]`` of the M samples with alpha that light reaches, and their features; others hardly matter."""
         lengths = self.space.lengths(t, points)
         lengths = lengths if isinstance(lengths, Tensor) else t.new_full((1,), lengths)
         unit = self.space.unit(points)
@@ -83,9 +83,9 @@ class HashField(OccupiedField):
 
     @torch.no_grad()
     def update_occupancy(self, draws: Draws, share: float) -> None:
-        """Update alpha at random points of a share of the cells, and of as many occupied ones; at 1 of all cells.
+        """Update the cells' alpha at random points in a ``share`` of them, and in as many occupied ones; 1: in all.
 
-        What was known of every cell fades, the larger number stays.
+        Every cell's stored alpha decays; the larger of it and the new one is kept.
         """
         count = len(self.alpha)
         if share < 1:
@@ -107,9 +107,9 @@ class HashField(OccupiedField):
 
     @torch.no_grad()
     def settle(self, below: float, rays: Rays, hull: Callable[[Tensor], Tensor]) -> None:
-        """Free cells permanently if they and their neighbours are below ``below``.
+        """Free cells permanently if they and their neighbours have less alpha than ``below``.
 
-        Not those on ``rays`` of the world that meet none with as much, where ``hull``, of points ``[M, 3]``, is true.
+        Cells on world ``rays`` that meet no cell of more alpha stay, where ``hull`` of points ``[M, 3]`` is true.
         """
         filled = self.alpha >= below
         lost = self.on_those_that_miss(rays, self.allowed & filled)
@@ -138,6 +138,6 @@ class HashField(OccupiedField):
 
     @torch.no_grad()
     def occupy(self, cells: Tensor) -> None:
-        """Take all but these cells ``[V]`` for free."""
+        """Mark these cells ``[V]`` (boolean) as occupied and all others as free."""
         self.occupancy.copy_(cells & self.allowed)
         self.around.copy_(self.grid.box_around(self.occupancy))

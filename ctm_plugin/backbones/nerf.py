@@ -77,7 +77,7 @@ class NeRF(RadianceBackbone):
         super().on_train_batch_start(batch, batch_idx)
 
     def _crop(self) -> None:
-        """Most of a picture may be background, and a network that learns nothing else first may stay empty."""
+        """Train on the pictures' middles at first: a network that learns background first may stay empty."""
         if self.global_step >= self.config.crop_steps:
             self.pool = None
         elif self.pool is None:
@@ -120,7 +120,7 @@ class NeRF(RadianceBackbone):
         return density.squeeze(1) * unit, latent.squeeze(1)
 
     def _spread(self, s: Tensor) -> Tensor:
-        """Map [0, 1] onto the rays: ``[R, S]`` to distances, or to NDC's own parameter."""
+        """Map shares ``[R, S]`` of the way from near to far to distances along rays, or to NDC's ray parameter."""
         near, far = self.space.near, self.space.far
         if self.config.geometry == "unbounded":
             return 1 / ((1 - s) / near + s / far)
@@ -129,7 +129,7 @@ class NeRF(RadianceBackbone):
     def _march(
         self, field: nn.Module, lines: Rays, directions: Tensor, t: Tensor, background: Tensor, draws: Draws | None
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Latent ``[R, k]``, weights ``[R, S]`` and transmittance ``[R]`` of samples at ``t`` ``[R, S]``.
+        """Render rays from samples at ``t`` ``[R, S]``: latent ``[R, k]``, weights ``[R, S]``, transmittance ``[R]``.
 
         The last sample stands for all that lies behind it.
         """

@@ -11,15 +11,15 @@ from ctm_plugin.rays.encoding import embed
 
 
 class NeRFField(nn.Module):
-    """``depth`` ReLU layers on the embedded position; layer ``skip`` (from 0) sees the embedding again.
+    """NeRF's MLP: ``depth`` ReLU layers on the embedded position; layer ``skip`` (from 0) sees the embedding again.
 
     Density is linear in the last of them, then ReLU. The latent has one more ReLU layer of half the width, on a linear
     feature of the last layer joined with the embedded direction, then a sigmoid.
 
     Args:
-        channels: of the latent.
-        width, depth, skip: of the trunk; 1 <= skip < depth.
-        position_frequencies, direction_frequencies: of the embeddings.
+        channels: number k of latent channels.
+        width, depth, skip: units a layer, number of layers, and the skip layer; 1 <= skip < depth.
+        position_frequencies, direction_frequencies: number of frequencies of the two embeddings.
     """
 
     def __init__(

@@ -26,7 +26,7 @@ RECOMPUTED_LAYERS = 2
 
 
 class Layers(NamedTuple):
-    """Weights of the network, the view layer's folded.
+    """Weights of NeRF's network; those of the view layer are folded (:meth:`NeRFField.layers`).
 
     Attributes:
         side: ``[R, V]``, what the view layer adds for each ray: its direction's part and its bias.
@@ -48,12 +48,12 @@ class Layers(NamedTuple):
 
     @classmethod
     def unflatten(cls, tensors: Sequence[Tensor]) -> Layers:
-        """Undo :meth:`flatten`, of the weights or of others of their shapes."""
+        """Undo :meth:`flatten`, for the weights or for tensors of the same shapes, such as gradients."""
         depth = (len(tensors) - 7) // 2
         return cls(*tensors[:7], tuple(tensors[7 : 7 + depth]), tuple(tensors[7 + depth :]))
 
     def flatten(self) -> tuple[Tensor, ...]:
-        """Put all in one row, for autograd, which looks into no tuples."""
+        """List all weights in one flat tuple: autograd does not look into nested ones."""
         return (*self[:7], *self.trunk, *self.biases)
 
 
@@ -109,7 +109,7 @@ def blocks_of_samples(
 
 
 def _in_type(layers: Layers, dtype: torch.dtype) -> Layers:
-    """Contiguous, of the products' type; what is added after the last product of a kind keeps its own."""
+    """Cast the weights to the products' type, contiguous; biases added after the last products keep their own."""
     flat = [tensor.to(dtype).contiguous() for tensor in layers.flatten()]
     return Layers.unflatten(flat)._replace(
         side=layers.side, density_bias=layers.density_bias, color_bias=layers.color_bias
@@ -177,7 +177,7 @@ def _block_backward(
     embedded: Tensor, hidden: list[Tensor], seen: Tensor, latent: Tensor, ray: Tensor,
     of_sample: tuple[Tensor, Tensor], layers: Layers, skip: int, grads: Layers,
 ) -> None:  # fmt: skip
-    """Add to ``grads`` those of N samples on rays ``[N]``, given their densities' and latents', ``of_sample``."""
+    """Add to ``grads`` the weights' gradients from N samples, given those of densities and latents, ``of_sample``."""
     dtype, threshold_backward = layers.view.dtype, torch.ops.aten.threshold_backward  # before a ReLU, of what came out
     density, logits = of_sample[0], of_sample[1] * latent * (1 - latent)
     grads.color_bias.add_(logits.sum(0))

@@ -18,10 +18,10 @@ class DirectedMLP(nn.Module):
     A subclass gives ``embed``.
 
     Args:
-        features: of a sample.
-        embedded: numbers that a direction becomes.
-        channels: of the latent.
-        width, depth: of the hidden layers, and how many layers there are.
+        features: number of a sample's features.
+        embedded: size of a direction's embedding.
+        channels: number k of latent channels.
+        width, depth: units of a hidden layer, and number of linear layers.
     """
 
     def __init__(self, features: int, embedded: int, channels: int, width: int, depth: int):
@@ -32,11 +32,11 @@ class DirectedMLP(nn.Module):
         nn.init.zeros_(self.layers[-1].bias)
 
     def embed(self, directions: Tensor) -> Tensor:
-        """``[R, 3]``, unit length, to ``[R, embedded]``."""
+        """Embed view directions ``[R, 3]``, unit length: ``[R, embedded]``."""
         raise NotImplementedError
 
     def forward(self, features: Tensor, directions: Tensor, ray_index: Tensor) -> Tensor:
-        """``[M, features]``, ``[R, 3]``, ``[M]`` to ``[M, channels]`` in [0, 1]."""
+        """Evaluate latents ``[M, channels]`` in [0, 1] of features ``[M, features]`` along directions ``[R, 3]``."""
         embedded = self.embed(directions)
         if features.device.type != "cpu":
             return self.whole(features, embedded, ray_index)
@@ -44,12 +44,12 @@ class DirectedMLP(nn.Module):
         return blocked_mlp(features, entry, [layer.weight for layer in layers], [layer.bias for layer in layers])
 
     def whole(self, features: Tensor, embedded: Tensor, ray_index: Tensor) -> Tensor:
-        """``forward`` without blocks, ``[M, channels]``: run on GPUs, and by tests that compare the blocks with it."""
+        """Evaluate ``forward`` in one go, ``[M, channels]``: for GPUs, and as the reference of the CPU's blocks."""
         return self.layers(torch.cat([features, embedded[ray_index]], dim=-1)).float().sigmoid()
 
 
 class ViewMLP(DirectedMLP):
-    """DVGO's: the direction d is embedded as ``[d, sin(2^p d), cos(2^p d)]``, p = 0..frequencies-1."""
+    """DVGO's colour network: the direction d is embedded as ``[d, sin(2^p d), cos(2^p d)]``, p = 0..frequencies-1."""
 
     def __init__(self, features: int, channels: int, width: int, depth: int, frequencies: int):
         super().__init__(features, 3 * (1 + 2 * frequencies), channels, width, depth)
@@ -60,7 +60,7 @@ class ViewMLP(DirectedMLP):
 
 
 class HarmonicMLP(DirectedMLP):
-    """NGP's: the direction becomes ``degrees`` degrees of spherical harmonics."""
+    """NGP's colour network: the direction is embedded as ``degrees`` degrees of spherical harmonics."""
 
     def __init__(self, features: int, channels: int, width: int, depth: int, degrees: int):
         super().__init__(features, degrees**2, channels, width, depth)
@@ -71,10 +71,10 @@ class HarmonicMLP(DirectedMLP):
 
 
 class FeaturesAndDirections:
-    """The entry of features: they and the embedded direction of their rays, see :mod:`ctm_plugin.cpu.blocked_mlp`.
+    """Input of a :mod:`ctm_plugin.cpu.blocked_mlp`: samples' features next to the embedded directions of their rays.
 
     Args:
-        embedded: ``[R, E]``.
+        embedded: ``[R, E]`` embedded directions.
         ray_index: ``[M]``, on which ray each lies.
     """
 
@@ -82,30 +82,30 @@ class FeaturesAndDirections:
         self.embedded, self.ray_index = embedded, ray_index
 
     def enter(self, table: Tensor, at: slice, out: Tensor) -> None:
-        """Write features and directions side by side, ``[n, features + E]``."""
+        """Write features and embedded directions side by side into ``out``, ``[n, features + E]``."""
         features = table.shape[1]
         out[:, :features] = table
         out[:, features:] = self.embedded.index_select(0, self.ray_index[at])
 
     def leave(self, grad: Tensor, entered: Tensor) -> Tensor:
-        """Keep the features' part, ``[n, features]``."""
+        """Give the features' part ``[n, features]`` of the input's gradient."""
         return grad[:, : -self.embedded.shape[1]]
 
 
 class AsItIs:
-    """The entry of a table that a network takes as it is."""
+    """Input of a :mod:`ctm_plugin.cpu.blocked_mlp` that is the table itself."""
 
     def enter(self, table: Tensor, at: slice, out: Tensor) -> None:
-        """Write the rows, ``[n, D]``."""
+        """Copy the table's rows ``[n, D]`` into ``out``."""
         out.copy_(table)
 
     def leave(self, grad: Tensor, entered: Tensor) -> Tensor:
-        """Keep it, ``[n, D]``."""
+        """Give the input's gradient ``[n, D]`` unchanged: it is the table's."""
         return grad
 
 
 class DensityMLP(nn.Module):
-    """Features ``[M, F]`` to ``[M, outputs]``: one hidden layer with a ReLU, the last one linear."""
+    """NGP's density network, features ``[M, F]`` to ``[M, outputs]``: a hidden ReLU layer, then a linear one."""
 
     def __init__(self, features: int, width: int, outputs: int):
         super().__init__()

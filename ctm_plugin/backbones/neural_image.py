@@ -14,11 +14,11 @@ from ctm_plugin.rays.encoding import embed
 
 
 class NeuralImage(nn.Module):
-    """``depth`` ReLU layers on the embedded position, then a linear layer and a sigmoid.
+    """A picture as an MLP: ``depth`` ReLU layers on the embedded position, then a linear layer and a sigmoid.
 
     Args:
-        channels: of the latent.
-        width, depth: of the hidden layers.
+        channels: number k of latent channels.
+        width, depth: units of a hidden layer, and number of hidden layers.
         frequencies: P of the embedding ``[x, sin(2^p pi x), cos(2^p pi x)]``; 0: the plain position.
         rescale: multiply the first layer's start by ``sqrt(inputs / 2)``, as only two of its inputs are used at first.
     """
@@ -53,7 +53,7 @@ class NeuralImage(nn.Module):
         return self._whole(points, weights, biases)
 
     def _whole(self, points: Tensor, weights: list[Tensor], biases: list[Tensor]) -> Tensor:
-        """All points in one go, for autograd: what GPUs run, and what tests compare the blocks with."""
+        """Evaluate all points in one go, for autograd: for GPUs, and as the reference of the CPU's blocks."""
         hidden = embed(points, self.frequencies)
         # Positions in bfloat16 would be half a pixel off.
         with torch.autocast(points.device.type, enabled=False):
@@ -64,8 +64,8 @@ class NeuralImage(nn.Module):
 
 
 class EmbeddedPositions(Entry):
-    """The entry of positions ``[N, 2]``: their embedding; of another type, with what rounding takes from the positions
-    in two columns before, which keeps 16 bits of them in bfloat16.
+    """Input of a blocked MLP: the embedding of positions ``[N, 2]``. In half precision the positions' rounding errors
+    stand in two columns before it, which keeps 16 bits of them in bfloat16.
 
     Args:
         frequencies: ``[P]`` of the embedding.

@@ -25,7 +25,7 @@ from ctm_plugin.scene.views import Scene
 SETTLING_UPDATES = 16
 """Updates of the occupancy before free cells become permanently free."""
 FOREGROUND_PIXELS = 1 << 16
-"""Number of foreground pixels whose rays must still hit a cell then."""
+"""Number of foreground pixels whose rays must still hit an occupied cell once free cells are permanent."""
 
 
 class NGP(OccupiedBackbone):

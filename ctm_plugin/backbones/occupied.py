@@ -30,13 +30,13 @@ from ctm_plugin.scene.views import Scene
 
 @dataclass
 class Samples:
-    """The packed samples that reached the colour of their rays.
+    """Packed samples that contribute to the colour of their rays.
 
     Attributes:
         latent: ``[M, k]`` in [0, 1].
-        weights: ``[M]``.
-        t: ``[M]``, where they lie along the space's rays.
-        ray_index: ``[M]``, on which ray each lies.
+        weights: ``[M]`` of volume rendering.
+        t: ``[M]``, positions of the samples along the space's rays.
+        ray_index: ``[M]``, the ray of each sample.
         transmittance: ``[R]``, behind the last sample of each ray.
     """
 
@@ -58,8 +58,8 @@ class OccupiedField(nn.Module):
     A subclass gives ``evaluate`` and may give ``reached``.
 
     Args:
-        space: where it lives.
-        grid: of the occupancy.
+        space: the space that the field fills.
+        grid: the occupancy grid.
         alpha_thre: samples with less alpha, or less weight, are skipped.
 
     Attributes:
@@ -74,19 +74,19 @@ class OccupiedField(nn.Module):
         self.register_buffer("around", space.aabb.clone())
 
     def evaluate(self, points: Tensor, *known: Tensor) -> tuple[Tensor, Shade]:
-        """Densities ``[M]``, optical depths over one measure of the space, at its points ``[M, 3]``, and their shade.
+        """Densities ``[M]`` (optical depth over one measure of the space) at points ``[M, 3]``, and the samples' shade.
 
-        ``known``: what ``reached`` found there.
+        ``known``: the tensors that ``reached`` gave for these points.
         """
         raise NotImplementedError
 
     def reached(self, t: Tensor, ray_index: Tensor, points: Tensor, n_rays: int) -> tuple[Tensor, ...]:
-        """Those samples ``[N]`` of ``n_rays`` rays that are worth a gradient, and what is known there."""
+        """Indices ``[N]`` of the samples of ``n_rays`` rays that are worth a gradient, and tensors known at them."""
         return t, ray_index, points
 
     def samples(self, rays: Rays, offset: Tensor | float, cells: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor]:
-        """``t`` ``[M]``, rays ``[M]`` and points ``[M, 3]`` of the space's rays, those outside free space, or in these
-        cells ``[V]``.
+        """Sample the space's rays outside free space, or in these cells ``[V]``: positions ``t`` ``[M]``, ray indices
+        ``[M]`` and points ``[M, 3]``.
         """
         grid, stride = self.grid, self.space.stride
         occupancy, around = (self.occupancy, self.around) if cells is None else (cells, self.space.aabb)
@@ -102,9 +102,9 @@ class OccupiedField(nn.Module):
         Only samples whose weight is above ``alpha_thre`` are shaded.
 
         Args:
-            rays: R of them.
+            rays: R rays of the world.
             background: ``[R, k]`` or ``[1, k]`` latent.
-            offset: where in a stride samples begin, in [0, 1): ``[R]``, or one for all.
+            offset: shift of the samples as a share of their stride, in [0, 1): ``[R]``, or one for all.
         """
         n_rays = len(rays.origins)
         with record_function("ctm/samples"):

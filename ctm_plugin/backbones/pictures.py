@@ -23,7 +23,7 @@ class RenderedView(NamedTuple):
 
     latent: Float[Tensor, "h w k"]
     opacity: Float[Tensor, "h w"]
-    """The share of the light that is stopped."""
+    """The share of each pixel's light that the scene stops."""
     depth: Float[Tensor, "h w"] | None
     """Expected distance along the ray; light that nothing stops counts as stopped at ``far``. Pictures of a training
     step need none."""
@@ -31,13 +31,13 @@ class RenderedView(NamedTuple):
 
 @dataclass
 class PictureBatch(Batch):
-    """The pixels that count of some training views, one view after the other, each row by row.
+    """A training batch: the unmasked pixels of some training views, one view after the other, each row by row.
 
     Attributes:
-        views: which ones.
+        views: indices of the training views.
         pixel: ``[R]``, flat indices over all training views.
         backgrounds: the latent ``[1, k]`` behind each view.
-        counted: for each view the pixels that count, ``[R_v]``, row by row; ``None``: all do.
+        counted: for each view the indices of its unmasked pixels, ``[R_v]``, row by row; ``None``: all.
     """
 
     views: tuple[int, ...] = field(kw_only=True)
@@ -48,7 +48,7 @@ class PictureBatch(Batch):
 
 @dataclass
 class PictureRendering(Rendering):
-    """The whole pictures, and the latents of the pixels that count."""
+    """Rendered whole pictures, and the latents of their unmasked pixels."""
 
     pictures: list[RenderedView] = field(kw_only=True)
 
@@ -81,10 +81,10 @@ class PictureBackbone(PosedBackbone):
         """Render a view in the latent space.
 
         Args:
-            views, index: whose camera; its pictures are not looked at.
+            views, index: the view whose camera is rendered from; its photograph is not used.
             background: ``[1, k]`` latent, seen where light passes the scene.
             draws: random numbers in training; ``None`` in evaluation, which must be deterministic and have depth.
-            every: of rows and columns, the first ones included.
+            every: render each ``every``-th row and column, the first ones included.
         """
         raise NotImplementedError
 
@@ -113,20 +113,20 @@ class PictureBackbone(PosedBackbone):
         )  # fmt: skip
 
     def counted(self, view: int) -> Tensor:
-        """The pixels of a training view that count, ``[R_v]``, row by row."""
+        """Indices of a training view's unmasked pixels, ``[R_v]``, row by row."""
         each = self.views.height * self.views.width
         if self.ends is None:
             return torch.arange(each, device=self.device)
         return self.unmasked[self.ends[view] : self.ends[view + 1]].long() - view * each
 
     def photographed_at(self, view: int, pixel: Tensor) -> Tensor:
-        """The colours at those pixels ``[R_v]`` of a training view that count."""
+        """The photographed colours at the unmasked pixels ``[R_v]`` of a training view."""
         each = self.views.height * self.views.width
         # Rows that lie one after the other need no look-up, which takes ten times as long.
         return self.pixels[view * each : (view + 1) * each] if self.ends is None else self.pixels[pixel]
 
     def view_of(self, number: int) -> int:
-        """The training view that comes at a place in the order of all that are trained on, from 0."""
+        """Index of the training view at place ``number``, from 0, in the random order in which views are trained on."""
         passes, place = divmod(number, len(self.scene.train))
         order = torch.randperm(len(self.scene.train), generator=Draws(self.seed, passes, stream="views").generator)
         return int(order[place])
@@ -143,7 +143,7 @@ class PictureBackbone(PosedBackbone):
 
     @torch.no_grad()
     def render_view(self, views: Views, index: int, every: int = 1, rays: int | None = None) -> dict[str, Tensor]:
-        """See :meth:`~ctm_plugin.backbones.posed.PosedBackbone.render_view`; a pixel has no number of rays here."""
+        """See :meth:`~ctm_plugin.backbones.posed.PosedBackbone.render_view`; ``rays`` has no effect here."""
         background = self.transform.encode(self.constant_background())
         picture = self.render(views, index, background, None, every)
         latent = picture.latent.float()

@@ -69,7 +69,7 @@ class PosedBackbone(Backbone):
         self.learn_from(scene.train)
 
     def learn_from(self, views: Views) -> None:
-        """Take these for the training views from here on: the scene's own, or the same with fewer pixels."""
+        """Train on ``views`` from here on: the scene's training views, or these with fewer pixels."""
         self.views, mask = views, views.mask
         unmasked = None if mask is None else mask.flatten().nonzero().squeeze(1).int()
         for name, table in (
@@ -109,12 +109,12 @@ class PosedBackbone(Backbone):
             ``[M, k]``, not defined where it is 0.
 
         Raises:
-            CTMError: the backbone does not tell.
+            CTMError: the backbone has no density to evaluate.
         """
         raise CTMError(f"{type(self).__name__} has no method query, which gives densities at points")
 
     def world_box(self) -> Float[Tensor, "2 3"]:
-        """What a mesh is made of: all that training views see up to far; of unbounded scenes the ball of cameras."""
+        """Box of a mesh's space: all that training views see up to far; of unbounded scenes the ball of cameras."""
         scene = self.scene
         if scene.geometry != "unbounded":
             return frustum_box(scene.train, scene.near, scene.far)
@@ -122,14 +122,14 @@ class PosedBackbone(Backbone):
         return torch.stack([centre - radius, centre + radius])
 
     def place(self, pixel: Tensor, rendered: Tensor) -> PixelPlaces:
-        """Where training pixels ``[R]`` lie on their pictures, with what is rendered there, ``[R, 3]`` sRGB."""
+        """Positions of training pixels ``[R]`` on their pictures, with the colours rendered there, ``[R, 3]`` sRGB."""
         height, width = self.views.height, self.views.width
         row = pixel.div(width, rounding_mode="floor")
         at = torch.stack([(pixel % width + 0.5) / width, (row % height + 0.5) / height], dim=-1)
         return PixelPlaces(row.div(height, rounding_mode="floor"), at, rendered.detach())
 
     def compare(self, batch: Any, latents: list[Tensor], uniform: Uniform) -> Compared:
-        """As every backbone, but renderings ``[R, k]`` as the pictures show them, and these as the field should."""
+        """Compare as every backbone does, with the appearance on renderings ``[R, k]`` and undone in the colours."""
         if (appearance := self.appearance) is None:
             return super().compare(batch, latents, uniform)
         place = self.place(batch.pixel, self.decode(latents[-1]))
@@ -143,7 +143,7 @@ class PosedBackbone(Backbone):
         return composite(self.pixels[pixel], self.constant_background())
 
     def _pixels(self, draws: Draws, count: int, pool: Tensor | None) -> Tensor:
-        """Flat indices of training pixels, ``[count]``, out of the pool, or of all."""
+        """Draw flat indices ``[count]`` of training pixels out of ``pool``; ``None``: out of all."""
         drawn = draws.integers(len(self.pixels) if pool is None else len(pool), count)
         return drawn if pool is None else pool[drawn].long()
 
@@ -166,7 +166,7 @@ class PosedBackbone(Backbone):
         """Draw colours to lie under training pixels, ``[rows, 3]``, and latents under their renderings, ``[rows, k]``;
         one of each where the background is constant.
 
-        ``first`` is the number of the first: random ones are the constant background at every fourth.
+        ``first`` is the number of the first row: every fourth row has the constant background where others are random.
         """
         with torch.autocast(self.device.type, enabled=False):  # colours want more than half precision
             kind, level = self.scene.background, self.scene.random_level
@@ -186,16 +186,16 @@ class PosedBackbone(Backbone):
             return color, self.transform.encode(color)
 
     def constant_background(self) -> Tensor:
-        """``[1, 3]``: the colour behind the scene in evaluation: white for ``white``, else black."""
+        """The colour ``[1, 3]`` behind the scene in evaluation: white for ``white``, else black."""
         return torch.full((1, 3), float(self.scene.background == "white"), device=self.device)
 
     def render_view(self, views: Views, index: int, every: int = 1, rays: int | None = None) -> dict[str, Tensor]:
-        """One view: ``rgb`` ``[H, W, 3]``, ``latent`` ``[H, W, k]``, ``depth`` and ``opacity`` ``[H, W]``.
+        """Render one view: ``rgb`` ``[H, W, 3]``, ``latent`` ``[H, W, k]``, ``depth`` and ``opacity`` ``[H, W]``.
 
         Args:
-            views, index: which one.
-            every: of rows and columns, the first one included.
-            rays: of a pixel, where a backbone has several; ``None``: as many as its pictures have.
+            views, index: the view.
+            every: render each ``every``-th row and column, the first ones included.
+            rays: rays a pixel, where a backbone has several; ``None``: as many as its pictures have.
         """
         raise NotImplementedError
 
@@ -203,7 +203,7 @@ class PosedBackbone(Backbone):
 
     @property
     def light(self) -> Light:
-        """What pictures of the scene are shown to people in, found from the training pictures. Differences between
+        """Light in which pictures of the scene are displayed, found from the training pictures. Differences between
         their exposures are removed first, as far as they are known.
         """
         if self.scene.light is not None:
@@ -221,7 +221,7 @@ class PosedBackbone(Backbone):
 
     @property
     def snapshots(self) -> Sequence[int]:
-        """Test views that have a picture; else the first one."""
+        """Indices of the test views that have a photograph; else of the first one."""
         views = self.scene.test
         return range(len(views)) if views.pictured is None else views.pictured.nonzero().flatten().tolist() or [0]
 
@@ -282,7 +282,7 @@ class PosedBackbone(Backbone):
         return result | lit | {"protocol": self._protocol(scoring.dataset)}
 
     def _protocol(self, dataset: Mapping[str, Any]) -> str:
-        """What two runs must share for their scores to stand in one cell of a table."""
+        """Description of the evaluation that two runs must share for their scores to stand in one cell of a table."""
         views, known = self.scene.test, self.scene.exposure
         exposure = dataset.get("exposure", 1.0 if known is None else known)
         scored = len(views) if views.pictured is None else int(views.pictured.sum())

@@ -36,7 +36,7 @@ def check_geometry(geometry: str, scene: Scene) -> None:
 
 @dataclass
 class RayBatch(Batch):
-    """Rays with their colours.
+    """A training batch of rays with their colours.
 
     Attributes:
         rays: R rays.
@@ -51,7 +51,7 @@ class RayBatch(Batch):
 
 @dataclass
 class RayRendering(Rendering):
-    """Latents with geometry.
+    """Rendered latents of rays, with their opacity and depth.
 
     Attributes:
         opacity: ``[R]``, the sum of the weights along each ray.
@@ -107,8 +107,8 @@ class RadianceBackbone(PosedBackbone):
 
     @torch.no_grad()
     def draw_those(self, hits: Callable[[Rays], Tensor]) -> None:
-        """Draw training pixels from those on whose rays ``hits`` is true, ``[R]``, from now on; from all, if it is on
-        none.
+        """Draw training pixels from now on only where ``hits``, ``[R]``, is true of their rays; from all pixels where
+        no ray hits.
         """
         pixels = self.unmasked
         if pixels is None:
@@ -121,8 +121,8 @@ class RadianceBackbone(PosedBackbone):
 
     @torch.no_grad()
     def render_rays(self, rays: Rays, color: Tensor | None = None, even: FixedDraws | None = None) -> RayRendering:
-        """Render any number of rays in chunks, without randomness, over a colour ``[1, 3]``, the constant background
-        unless it is given; ``even``: what they draw.
+        """Render any number of rays in chunks, without randomness, over a colour ``[1, 3]``, by default the constant
+        background; ``even``: the numbers that take the place of random ones.
         """
         background = self.transform.encode(self.constant_background() if color is None else color)
         size = self.eval_chunk * times_a_chunk(self.device)
@@ -134,14 +134,14 @@ class RadianceBackbone(PosedBackbone):
         return RayRendering((latent,), opacity=opacity, depth=depth)
 
     def render_view(self, views: Views, index: int, every: int = 1, rays: int | None = None) -> dict[str, Tensor]:
-        """One view: ``rgb`` ``[H, W, 3]``, ``latent`` ``[H, W, k]``, ``depth`` and ``opacity`` ``[H, W]``.
+        """Render one view: ``rgb`` ``[H, W, 3]``, ``latent`` ``[H, W, k]``, ``depth`` and ``opacity`` ``[H, W]``.
 
-        Means over the rays of each pixel, but ``rgb``, which is decoded of the mean latent.
+        Each is the mean over the rays of a pixel, but ``rgb``, which is decoded from the mean latent.
 
         Args:
-            views, index: which one.
-            every: of rows and columns, the first one included.
-            rays: of a pixel, a square number, 1 through its centre; ``None``: as many as the backbone's pictures have.
+            views, index: the view.
+            every: render each ``every``-th row and column, the first ones included.
+            rays: rays a pixel, a square number, 1 through its centre; ``None``: as many as the backbone's pictures.
         """
         count = self.rays_per_pixel if rays is None else rays
         height, width = views.height, views.width

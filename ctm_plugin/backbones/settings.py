@@ -51,7 +51,7 @@ class FieldConfig(Settings, section="backbone"):
 
 @dataclass(frozen=True, kw_only=True)
 class DVGOConfig(FieldConfig):
-    """The defaults are the paper's (DVGO's own for Synthetic-NeRF and LLFF).
+    """Settings of DVGO. The defaults are the paper's (DVGO's own for Synthetic-NeRF and LLFF).
 
     Unbounded scenes are refused: ``backbone=ngp`` takes them. ``trainer=quick`` is made for pictures of 100 to 250
     pixels a side, ``trainer=standard`` for about 500x375. On a CPU, numba compiles loops at the first run. It keeps
@@ -143,7 +143,7 @@ class DVGOConfig(FieldConfig):
 
 @dataclass(frozen=True, kw_only=True)
 class NGPConfig(FieldConfig):
-    """The defaults are the paper's, where it has them.
+    """Settings of NGP. The defaults are the paper's, where it has them.
 
     In ``unbounded`` scenes, what stands among the cameras is resolved finely, and what lies behind it more coarsely
     with its distance. ``rays_per_pixel=1`` makes pictures in a quarter of the time. On a CPU, tables of 2^16 rows stay
@@ -207,7 +207,7 @@ class NGPConfig(FieldConfig):
 
 @dataclass(frozen=True, kw_only=True)
 class NeRFConfig(Settings, section="backbone"):
-    """The defaults are the paper's (NeRF's own for Synthetic-NeRF).
+    """Settings of NeRF. The defaults are the paper's (NeRF's own for Synthetic-NeRF).
 
     A run that ends as an empty scene has ``converged`` false in its ``metrics.json``.
     """
@@ -250,7 +250,7 @@ class NeRFConfig(Settings, section="backbone"):
 
 @dataclass(frozen=True, kw_only=True)
 class SplatConfig(Settings, section="backbone"):
-    """The defaults are those of 3DGS.
+    """Settings of Gaussian splats. The defaults are those of 3DGS.
 
     Captures (``dataset=colmap``, ``dataset=transforms``) train splats when no backbone is named. On a GPU Triton's
     kernels composite them; without it they stay on the processor. More of ``bend``, ``opacity`` and ``size`` makes
@@ -313,7 +313,7 @@ class SplatConfig(Settings, section="backbone"):
 
 @dataclass(frozen=True, kw_only=True)
 class BARF2DConfig(Settings, section="backbone"):
-    """The defaults are BARF's, which the paper uses."""
+    """Settings of BARF-2D. The defaults are BARF's, which the paper uses."""
 
     default_dataset = "planar"
 

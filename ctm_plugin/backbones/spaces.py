@@ -17,18 +17,18 @@ from ctm_plugin.scene.views import Scene
 
 
 class Box(nn.Module):
-    """A box of the world. Its rays are the world's, and run from ``near`` to ``far``.
+    """Space that is a box of the world: its rays are the world's, from ``near`` to ``far``.
 
     Args:
         box: ``[2, 3]``, in the space.
-        near, far: the part of its rays that is looked at.
+        near, far: distances along rays between which samples lie.
         behind: distance in the world at which light that nothing stops counts as stopped.
 
     Attributes:
-        stride: between samples along its rays, once :meth:`divide` has set it.
-        measure: what a length along its rays is divided by to become an optical depth's; the box's longest side.
-        side: the box's longest.
-        longest: no ray is longer in it.
+        stride: distance between samples along rays of the space, once :meth:`divide` has set it.
+        measure: unit of length along rays that optical depths are given for; the box's longest side.
+        side: the box's longest side.
+        longest: upper bound of a ray's length in the space.
     """
 
     contracted = False
@@ -43,36 +43,36 @@ class Box(nn.Module):
         self.longest = float((box[1] - box[0]).norm())
 
     def divide(self, stride: float) -> None:
-        """Set the distance between samples along its rays."""
+        """Set the distance between samples along rays of the space."""
         self.stride = stride
 
     def spacing(self, shape: Shape) -> float:
-        """Length along its rays from one vertex of a grid of that shape to the next."""
+        """Length along rays of the space from one vertex of a grid of that shape to the next."""
         return voxel_size(self.aabb, shape[0] * shape[1] * shape[2])
 
     def local(self, rays: Rays) -> Rays:
-        """The world's rays in the space."""
+        """Transform rays of the world into the space."""
         return rays
 
     def ends(self, rays: Rays, around: Tensor) -> tuple[Tensor, Tensor]:
-        """First and last distance ``[R]`` of the samples of its rays; outside the box ``around`` ``[2, 3]`` all is
-        free."""
+        """First and last distance ``[R]`` of the samples on rays of the space; outside the box ``around`` ``[2, 3]``
+        there are none."""
         return intersect_box(rays, around, self.near, self.far)
 
     def unit(self, points: Tensor) -> Tensor:
-        """Its points ``[M, 3]`` in the unit cube, scaled by the longest side."""
+        """Map points ``[M, 3]`` of the space into the unit cube, scaled by the longest side."""
         return (points - self.aabb[0]) / self.side
 
     def lengths(self, t: Tensor, points: Tensor) -> Tensor | float:
-        """Lengths of samples, ``[M]`` or one number for all, in ``measure``."""
+        """Lengths of samples in units of ``measure``, ``[M]`` or one number for all."""
         return self.stride / self.measure
 
     def distances(self, rays: Rays, t: Tensor, at: Any) -> Tensor:
-        """Distances in the world of samples at ``t`` on the lines of ``rays[at]``, the world's."""
+        """Distances in the world of samples at ``t`` along the rays ``rays[at]`` of the world."""
         return t
 
     def place(self, points: Tensor) -> tuple[Tensor, Tensor | float]:
-        """The world's points ``[M, 3]`` in the space, and the length of a world's unit there, as :meth:`lengths`."""
+        """Map the world's points ``[M, 3]`` into the space; also give a world unit's length there, in ``measure``."""
         return points, 1 / self.measure
 
 
@@ -98,13 +98,13 @@ class NDCSpace(Box):
 
 
 class Ball(Box):
-    """All of space, contracted; rays end at infinity.
+    """Space that is all of the world, contracted into a ball; rays end at infinity.
 
     Args:
-        centre: ``[3]``, of the unit ball in the world.
-        radius: of it.
-        near: where rays begin, in the world.
-        behind: as of a box.
+        centre: ``[3]``, centre of the unit ball in the world.
+        radius: radius of the unit ball in scene units.
+        near: distance in the world at which rays begin.
+        behind: see :class:`Box`.
     """
 
     contracted = True
@@ -137,7 +137,7 @@ class Ball(Box):
 
 
 def space_of(scene: Scene, geometry: str, box: Tensor | None = None) -> Box:
-    """The space of a scene by its geometry; with a box ``[2, 3]`` in place of all that cameras see."""
+    """Make the space of a scene for a geometry, over a box ``[2, 3]``, by default all that cameras see."""
     train, near, far = scene.train, scene.near, scene.far
     if geometry == "unbounded":
         return Ball(*camera_ball(train, near), near, far)

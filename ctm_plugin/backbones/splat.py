@@ -102,16 +102,16 @@ class Splat(PictureBackbone):
 
     @cached_property
     def stages(self) -> list[Stage]:
-        """Parts of the schedule whose pictures are averaged; computed when a training begins."""
+        """Parts of the schedule that train on downscaled pictures; computed when a training begins."""
         return stages(self.scene.train) if self.config.coarse else []
 
     def side_at(self, step: int | float) -> int:
-        """Pixels a side of the squares that are one pixel at a step of the schedule."""
+        """Side in pixels of the squares that are averaged into one pixel at a step of the schedule."""
         done = step / self.schedule_steps
         return next((stage.side for stage in self.stages if done < stage.until), 1)
 
     def cost(self, first: int | float, last: int | float) -> float:
-        """Cost of steps, each its share of the pixels plus ``0.7 x^2``, x its share of the growth (measured)."""
+        """Mean relative cost of a step: its share of pixels plus ``0.7 x^2``, x its share of the growth (measured)."""
         step, until = max(last - first, 1) / PARTS, max(self.config.grow_until, 1)
         places = [first + (part + 0.5) * step for part in range(PARTS)]
         return sum(1 / self.side_at(place) ** 2 + SPLAT_COST * min(place / until, 1) ** 2 for place in places) / PARTS
@@ -263,9 +263,9 @@ class Splat(PictureBackbone):
         rewrap(self.trainer)
 
     def _replace(self, change: Change) -> None:
-        """Replace rows of the tables, and of Adam's moments.
+        """Replace rows of the Gaussians' parameters and of Adam's moments.
 
-        Each is a new parameter: where the graph of an earlier step still lives, it knows the old one's size.
+        Each table is a new parameter: the graph of an earlier step, if it still lives, knows the old one's size.
         """
         for name, added in change.added._asdict().items():
             old = self.tables[name]
@@ -278,7 +278,7 @@ class Splat(PictureBackbone):
         self.grad2d_count = torch.zeros_like(self.grad2d)
 
     def _reset(self) -> None:
-        """Make all nearly transparent: Gaussians that the pictures need regain opacity, floaters do not."""
+        """Make all Gaussians nearly transparent: those that the pictures need regain opacity, floaters do not."""
         table = self.tables["opacities"]
         table.clamp_(max=math.log(RESET_OPACITY / (1 - RESET_OPACITY)))
         for moment in self.named_optimizers.state.get(table, {}).values():

@@ -1,4 +1,4 @@
-"""A look at a field while it trains, which does not change the training."""
+"""Snapshots of a field while it trains, which do not change the training."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ COLORS = 1024
 
 
 def snapshot(module: Backbone, view: int) -> Snapshot:
-    """What a backbone shows of a test view, and the colours as its transform sees them.
+    """Snapshot of a test view by a backbone, with pictures of the training colours and of their latents.
 
     Weights, modes and random states of the training stay as they are.
 
@@ -40,7 +40,7 @@ def snapshot(module: Backbone, view: int) -> Snapshot:
 
 @contextmanager
 def untouched(module: Backbone) -> Iterator[None]:
-    """Within it a module is in evaluation mode; weights, modes and random states of the training stay as they are."""
+    """Context with a module in evaluation mode; weights, modes and random states of the training stay as they are."""
     modes = [(part, part.training) for part in module.modules()]
     module.eval()
     try:

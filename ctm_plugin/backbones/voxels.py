@@ -20,14 +20,14 @@ class VoxelField(OccupiedField):
     ``softplus(s + shift)``. Interpolated first, activated after: one voxel can hold a sharp surface.
 
     Args:
-        space: whose box it fills.
+        space: the space whose box the grids fill.
         shape: vertices along each side.
         features: channels of the feature table.
-        color: makes latents of features.
-        direct: the features are latents themselves, before a sigmoid, and ``color`` is only kept.
+        color: network from features to latents.
+        direct: the features are the latents before a sigmoid, and ``color`` is kept but not used.
         alpha_thre: see :class:`OccupiedField`.
         step: distance between samples, in voxels or planes.
-        shift: one number, or one a plane, ``[Z]``, between which it is interpolated.
+        shift: shift of the raw density: one number, or one a plane, ``[Z]``, interpolated between planes.
 
     Attributes:
         sparse: whether the tables get sparse gradients, see :func:`~ctm_plugin.rays.grid.lookup`.
@@ -48,7 +48,7 @@ class VoxelField(OccupiedField):
             self.vertex_shift = shift
 
     def shift_at(self, points: Tensor) -> Tensor | float:
-        """The shift at points ``[M, 3]``."""
+        """Shift of the raw density at points ``[M, 3]``."""
         if not isinstance(self.vertex_shift, Tensor):
             return self.vertex_shift
         last = len(self.vertex_shift) - 1
@@ -69,12 +69,12 @@ class VoxelField(OccupiedField):
 
     @torch.no_grad()
     def alpha(self) -> Tensor:
-        """``[X, Y, Z]``: alpha of one sample at each vertex."""
+        """Alpha of one sample at each vertex, ``[X, Y, Z]``."""
         raw = as_volume(self.density, self.grid.shape)[0]
         return -torch.expm1(-F.softplus(raw + self.vertex_shift) * (self.space.stride / self.space.measure))
 
     def dilated_alpha(self) -> Tensor:
-        """``[V]``: the largest alpha of each vertex and its 26 neighbours, in the table's order."""
+        """Largest alpha of each vertex and its 26 neighbours, ``[V]``, in the table's order."""
         return dilate(self.alpha()).flatten()
 
     @torch.no_grad()

@@ -18,16 +18,16 @@ from ctm_plugin.optim.schedules import exponential
 
 
 class AttachTransform(L.Callback):
-    """Make a transform the module's ``transform``, fitted before the first step and trained by an Adam of its own.
+    """Attach a colour transform to a LightningModule, fitted before the first step and trained by an Adam of its own.
 
-    The module trains in its colours by :func:`ctm_plugin.front.losses` and shows what it renders by ``decode``. Its own
-    ``configure_optimizers`` stays as it is; both optimizers are stepped as one, so that accumulation, clipping,
+    As ``self.transform`` it gives the module loss terms (:func:`ctm_plugin.front.losses`) and decodes renderings. The
+    module's ``configure_optimizers`` stays; both optimizers are stepped as one, so that accumulation, clipping,
     precision and checkpoints are the Trainer's. This package's backbones get their transform when they are made.
 
     Args:
         transform: see :func:`ctm_plugin.front.transform`.
         colors: sRGB in [0, 1], of training pixels, some ten thousand.
-        seed: of what is drawn from them.
+        seed: seed of the random colours drawn from ``colors``.
     """
 
     def __init__(self, transform: ColorTransform, colors: Float[Tensor, "n 3"], seed: int = 0):

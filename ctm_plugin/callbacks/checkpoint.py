@@ -36,7 +36,7 @@ class CheckpointFile(TorchCheckpointIO):
 
 
 class RunInfo(L.Callback):
-    """Put the run's configuration, plain containers, into its checkpoints: another run's is recognised."""
+    """Put the run's configuration, plain containers, into its checkpoints, so that another run's is recognised."""
 
     def __init__(self, config: Config):
         self.config = dict(config)
@@ -55,13 +55,13 @@ class LastCheckpoint(L.Callback):
 
     Args:
         run: the run directory, for the message.
-        path, previous: of the checkpoint, and of the one before it.
+        path, previous: files of the latest checkpoint and of the one before it.
         every: optimizer steps between saves, >= 1.
 
     Attributes:
-        begun: whether training has: a checkpoint that it goes on from is restored by then.
+        begun: whether training has begun; a checkpoint to resume from is restored by then.
         signalled, signal: whether a signal came to this process, and which.
-        stopped: whether one came to any process.
+        stopped: whether a signal came to any process.
     """
 
     def __init__(self, run: Path, path: Path, previous: Path, every: int):
@@ -71,13 +71,13 @@ class LastCheckpoint(L.Callback):
 
     @contextmanager
     def listening(self) -> Iterator[None]:
-        """Take Ctrl-C and SIGTERM for requests to stop, round a ``fit``."""
+        """Context round a ``fit`` in which Ctrl-C and SIGTERM stop the training after its step."""
         with handling(self._stop, *SIGNALS) as self._before:
             yield
 
     @contextmanager
     def stopping_at_once(self, when: str) -> Iterator[None]:
-        """Let SIGTERM end what needs no saving, such as scoring."""
+        """Context in which SIGTERM ends at once work that needs no saving, such as scoring."""
 
         def stop(number: int, frame: Any) -> None:
             raise Interrupted(when, self.run, number)

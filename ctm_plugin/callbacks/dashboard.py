@@ -58,7 +58,7 @@ class Dashboard(L.Callback):
             logger.save()
 
     def _extra(self, trainer: L.Trainer, pl_module: Backbone) -> None:
-        """Show what the validations of a training leave out: its first and its last step."""
+        """Log pictures of the first and the last step, which have no validation."""
         if trainer.is_global_zero and trainer.loggers and trainer.enable_validation:
             seen = snapshot(pl_module, pl_module.snapshots[0])
             self._pictures(trainer, seen)

@@ -20,15 +20,15 @@ SYNC_STEPS = 16
 
 
 class Deadline(L.Callback):
-    """Stretch or cut what is left of a backbone's schedule, so that it ends after so many seconds.
+    """Stretch or cut the rest of a backbone's schedule, so that the training ends after ``seconds``.
 
     It looks at the clock at the end of each twentieth of the time or of the schedule, whichever comes first, and takes
     the steps since the last look for those to come, weighed by :meth:`Backbone.cost`. What it decides is part of the
     backbone's checkpoint; a run that goes on has what is left of its time.
 
     Args:
-        seconds: of training, interruptions left out.
-        stopwatch: which counts them.
+        seconds: time limit of the training, interruptions left out.
+        stopwatch: the callback that counts the seconds.
     """
 
     def __init__(self, seconds: float, stopwatch: Stopwatch):
@@ -36,7 +36,7 @@ class Deadline(L.Callback):
 
     @property
     def left(self) -> float:
-        """Seconds of training that are left."""
+        """Seconds that the training still has."""
         return max(self.seconds - self.stopwatch.seconds, 0.0)
 
     def on_train_start(self, trainer: L.Trainer, pl_module: Backbone) -> None:

@@ -1,4 +1,4 @@
-"""A film of a training, of backbones that give its pictures: an alignment's, while it is learned (paper, Figure 6)."""
+"""A film of a training, for backbones that draw its frames: BARF-2D's alignment as it is learned (paper, Figure 6)."""
 
 from __future__ import annotations
 

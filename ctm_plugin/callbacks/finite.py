@@ -21,7 +21,7 @@ class FiniteLoss(L.Callback):
     sums of their values, so that they stop together.
 
     Args:
-        kept: the checkpoint that stays, for the message.
+        kept: file of the last good checkpoint, for the message.
     """
 
     def __init__(self, kept: Path):
@@ -51,7 +51,7 @@ class FiniteLoss(L.Callback):
                 raise DivergedError(trainer.global_step, f"parameter '{name}'", math.nan, self.kept)
 
     def check(self) -> None:
-        """Read what is pending.
+        """Read the loss values that are on their way from the device.
 
         Raises:
             DivergedError: a term is NaN or infinite.

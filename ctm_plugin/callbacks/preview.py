@@ -1,4 +1,4 @@
-"""A first look at what is being trained, for people who wait."""
+"""An early picture of a training, for people who wait."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ PREVIEW = "preview.png"
 
 
 class Preview(L.Callback):
-    """Write ``RUN/preview.png`` after the first tenth: a test view, lit, and its photograph in that light."""
+    """Write ``RUN/preview.png`` after a tenth of the schedule: a lit test view and its photograph in that light."""
 
     def on_train_batch_end(self, trainer: L.Trainer, pl_module: PosedBackbone, *_: Any) -> None:
         path = Path(trainer.default_root_dir, PREVIEW)

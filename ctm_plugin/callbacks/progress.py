@@ -17,7 +17,7 @@ from ctm_plugin.show.bars import Update, bar, error_console
 
 @dataclass(eq=False)
 class ProgressLine(L.Callback):
-    """Steps, loss, PSNR of the batch in RGB, rays a second and ETA; a line now and then where there is no terminal."""
+    """Progress bar: steps, loss, PSNR of the batch in RGB, rays a second, ETA; lines where there is no terminal."""
 
     def __post_init__(self) -> None:
         self.console = error_console()

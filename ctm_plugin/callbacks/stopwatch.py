@@ -1,4 +1,4 @@
-"""What a training took, over all its interruptions."""
+"""Time and memory that a training took, over all its interruptions."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from ctm_plugin.backbones.base import Backbone
 
 
 class Stopwatch(L.Callback):
-    """Seconds of training (pre-training of the transform included), and the largest memory seen.
+    """Count seconds of training (pre-training of the transform included), and the largest memory used.
 
     Kept in the checkpoint, so that a resumed run counts on. It stops with the last step: what comes after, saving and
     scoring, is no training, and the last checkpoint holds what ``metrics.json`` does.
@@ -62,7 +62,7 @@ def synchronise(device: torch.device) -> None:
 
 
 def peak_memory_mb(device: torch.device) -> float:
-    """Tell the largest memory of this process so far, in MiB: a GPU's, if it is one, else resident memory.
+    """Tell this process's largest memory so far, in MiB: GPU memory if ``device`` is a GPU, else resident memory.
 
     Resident memory counts all jobs of a process: in a sweep, a job has at least what those before it had.
     """

@@ -1,1 +1,1 @@
-"""Where photographs were taken from, found by COLMAP on brightened copies."""
+"""Search for the cameras of photographs, by COLMAP on brightened copies."""

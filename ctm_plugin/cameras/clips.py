@@ -1,4 +1,4 @@
-"""Frames of clips, in a folder where the photographs of a capture are looked for."""
+"""Frames of clips, written into the folder of a capture's photographs."""
 
 from __future__ import annotations
 
@@ -17,24 +17,24 @@ from ctm_plugin.files import replacing_folder
 from ctm_plugin.show.bars import bar
 
 STILL_CLIP = "a clip in which next to nothing moves", "one that goes around or past what it shows"
-"""What was found, and what was expected, where a clip hardly moves."""
+"""Pair of found and expected, for the error that a clip hardly moves."""
 
 
 def is_clip(path: Path) -> bool:
-    """Tell whether a file is a clip by its name; hidden ones are none."""
+    """Tell whether a file is a video clip, by its suffix; hidden files are not."""
     return path.suffix.lower() in CLIP_SUFFIXES and not path.name.startswith(".")
 
 
 def root_of(given: Path) -> Path:
-    """Find the folder of a capture: the one that is given, or that of a clip's frames, next to the clip."""
+    """Find a capture's folder: the given folder itself, or the folder of a given clip's frames, next to the clip."""
     return given.with_suffix("") if is_clip(given) and given.is_file() else given
 
 
 def take_frames(given: Path, pictures: str) -> Path:
-    """Write the frames of a clip that are worth keeping, or of all clips in a folder, and say so.
+    """Write the sharpest frames of a clip, or of all clips in a folder, as photographs; print how many.
 
     Frames of ``NAME.mp4`` go to the folder ``NAME/images``, of clips in a folder to ``NAME`` among its photographs.
-    Those that are there already are used; what came with a still, as a Live Photo does, is left out.
+    Frames written earlier are used; clips that came with a still, as Live Photos do, are left out.
 
     Args:
         given: a folder or a clip.
@@ -44,7 +44,7 @@ def take_frames(given: Path, pictures: str) -> Path:
         The folder of the capture, see :func:`root_of`.
 
     Raises:
-        DataError: a clip cannot be used, and nothing else is there.
+        DataError: a clip cannot be used, and there are no photographs besides.
     """
     root = root_of(given)
     folders = {given: root / pictures} if root != given else folders_of_clips(given, pictures)
@@ -78,7 +78,7 @@ def take_frames(given: Path, pictures: str) -> Path:
 
 
 def folders_of_clips(given: Path, pictures: str) -> dict[Path, Path]:
-    """Find the clips in a folder and those below it, and a folder for the frames of each."""
+    """Map the clips in a folder, and in folders below it, to a folder for the frames of each."""
     root = require_folder(given, "a folder with photographs or clips, or a clip")
     files = below(root)
     stills = {fold(str(path.with_suffix(""))) for path in files if path.suffix.lower() in PICTURE_SUFFIXES}

@@ -1,4 +1,4 @@
-"""COLMAP's own pipeline by way of pycolmap, in stages that can be shown and stopped: details, pairs, places.
+"""COLMAP's pipeline by pycolmap, in stages that can be shown and stopped: keypoints, matches, poses.
 
 Only on CPUs, which is what pycolmap's wheels are made for.
 """
@@ -28,10 +28,10 @@ Reconstruction = Any
 DATABASE = "database.db"
 """Name of COLMAP's database in the working folder."""
 STANDARD = (100, 30, 16.0)
-"""COLMAP's own start: least matches of the first two pictures, of each other one, least degrees between the first
-two."""
+"""COLMAP's defaults to start a model: least matches of the first two pictures, of each other picture, and least
+degrees between the first two."""
 FEWER_MATCHES, CLOSER = (30, 15, 16.0), (30, 15, 6.0)
-"""Starts for noisy pictures and after a failed model: fewer matches, and a smaller angle between the first two."""
+"""Starts of a model of noisy pictures and after a failed one: fewer matches, smaller angle of the first two."""
 MIN_TRACK = 3
 """Least number of pictures that see a point which counts: two can agree on a place that is wrong."""
 PAIR_CHUNK = 16
@@ -41,11 +41,11 @@ FILM_DIAGONAL = 43.27
 
 
 class Features(NamedTuple):
-    """Details of a picture.
+    """Keypoints of a picture with their descriptors.
 
     Attributes:
-        places: ``[N, 4]`` column, row, scale, turn, in pixels of the whole picture.
-        descriptors: what they look like, as pycolmap holds it, or a network's, ``[N, 64]``.
+        places: ``[N, 4]`` column, row, scale, orientation of each keypoint, in pixels of the whole picture.
+        descriptors: descriptors of the keypoints, of pycolmap's type, or a network's, ``[N, 64]``.
     """
 
     places: Float32[np.ndarray, "n 4"]
@@ -54,12 +54,12 @@ class Features(NamedTuple):
 
 @dataclass(frozen=True)
 class Workshop:
-    """A database of COLMAP's in a scratch folder, and how to fill it.
+    """A database of COLMAP's in a working folder, with the stages that fill it.
 
     Attributes:
-        folder: for what lies between the stages.
-        threads: of the processor's; -1: all.
-        seed: of COLMAP's random numbers.
+        folder: folder for the files between the stages.
+        threads: number of CPU threads; -1: all.
+        seed: seed of COLMAP's random numbers.
     """
 
     folder: Path
@@ -71,21 +71,21 @@ class Workshop:
         return self.folder / DATABASE
 
     def stored(self) -> int:
-        """How many pictures are stored, each whole."""
+        """Number of pictures that are stored completely in the database."""
         database = require_pycolmap().Database.open(self.database)
         count = database.num_images()
         database.close()
         return count
 
     def details(self) -> int:
-        """How many details all pictures have."""
+        """Number of keypoints of all pictures in the database."""
         database = require_pycolmap().Database.open(self.database)
         count = database.num_keypoints()
         database.close()
         return count
 
     def looks(self, count: int) -> list[Float32[Tensor, "n 128"]]:
-        """What the ``count`` largest SIFT details of each picture look like, of length 1."""
+        """Descriptors, of length 1, of the ``count`` largest SIFT keypoints of each picture."""
         database = require_pycolmap().Database.open(self.database)
         found = []
         for number in range(1, database.num_images() + 1):
@@ -97,8 +97,8 @@ class Workshop:
     def store(self, headers: Sequence[Header], lens: str, features: Iterable[Features]) -> None:
         """Write pictures, numbered from 1 and named by their numbers: a camera for each lens and size.
 
-        True names come last (:meth:`reconstruct`): COLMAP's lists of pairs cannot hold those with spaces. ``features``
-        are of the pictures that are not :meth:`stored`.
+        Pictures get their names back in :meth:`reconstruct`: COLMAP's lists of pairs cannot hold names with spaces.
+        ``features`` are those of the pictures that are not yet :meth:`stored`.
         """
         colmap = require_pycolmap()
         begun = self.stored()
@@ -132,11 +132,11 @@ class Workshop:
         done: Callable[[int], None],
         nearest: Callable[[int, int], Any] | None = None,
     ) -> int:
-        """Compare pairs of pictures' numbers, and keep what one motion of a camera explains.
+        """Match the keypoints of pairs of pictures, given by number, and keep matches that one camera motion explains.
 
-        ``done`` is called with the number of pairs that have been compared, those of before it was stopped too.
-        Returned is how many show the same thing. ``nearest`` finds the rows of details that match, ``[M, 2]``; by
-        default COLMAP compares SIFT's.
+        ``done`` is called with the number of pairs that have been matched, those of a stopped search included.
+        Returned is the number of pairs with verified matches. ``nearest`` finds the rows of keypoints that match,
+        ``[M, 2]``; by default COLMAP compares SIFT's.
         """
         colmap = require_pycolmap()
         matching, checking = colmap.FeatureMatchingOptions(), colmap.TwoViewGeometryOptions()
@@ -163,9 +163,9 @@ class Workshop:
     def reconstruct(
         self, names: Sequence[str], start: tuple[int, int, float], done: Callable[[int], None]
     ) -> Reconstruction | None:
-        """Place pictures one after the other: the model with most sights; ``None`` where not even two pictures fit.
+        """Reconstruct incrementally: give the model with most :func:`sights`; ``None`` where not even two pictures fit.
 
-        ``start`` is as :data:`STANDARD`; ``done`` is called with the number of pictures that have a place.
+        ``start`` has the numbers of :data:`STANDARD`; ``done`` is called with the number of pictures that have a pose.
         """
         colmap = require_pycolmap()
         options = colmap.IncrementalPipelineOptions()
@@ -198,15 +198,15 @@ class Workshop:
 
 
 def sights(model: Reconstruction) -> int:
-    """How often pictures see points that at least :data:`MIN_TRACK` of them see."""
+    """Number of a model's observations of points that at least :data:`MIN_TRACK` pictures see."""
     lengths = (point.track.length() for point in model.points3D.values())
     return sum(length for length in lengths if length >= MIN_TRACK)
 
 
 def adjust(model: Reconstruction, threads: int, tolerance: float = 1e-6) -> None:
-    """Bundle adjustment of a whole model: errors beyond a pixel count less and less; two cameras hold it in place.
+    """Adjust a whole model by bundle adjustment: a robust loss from a pixel on; two cameras fix the gauge.
 
-    It ends where a step makes less than ``tolerance`` of the error vanish.
+    It ends when a step reduces the error by less than the share ``tolerance``.
     """
     colmap = require_pycolmap()
     options, what = colmap.BundleAdjustmentOptions(), colmap.BundleAdjustmentConfig()
@@ -221,7 +221,7 @@ def adjust(model: Reconstruction, threads: int, tolerance: float = 1e-6) -> None
 
 
 def require_pycolmap() -> ModuleType:
-    """COLMAP as a module, which prints only errors."""
+    """Import pycolmap, set to print only errors; a message names the extra that installs it."""
     try:
         import pycolmap  # after Pillow, imported above: the zlib that its wheel shows would be taken for Pillow's
     except ImportError as error:
@@ -231,7 +231,7 @@ def require_pycolmap() -> ModuleType:
 
 
 def focal_length(header: Header) -> tuple[float, bool]:
-    """A focal length to begin with, in pixels: the one that EXIF tells, else 1.2 times the longer side; and which."""
+    """Initial focal length in pixels, by EXIF, else 1.2 times the longer side; and whether it is EXIF's."""
     film = header.lens.film
     if film is None:
         return 1.2 * max(header.height, header.width), False
@@ -239,9 +239,9 @@ def focal_length(header: Header) -> tuple[float, bool]:
 
 
 def extract(picture: Float32[np.ndarray, "h w"], scale: int, pooled: bool) -> Features:
-    """SIFT's details of a picture, grey in [0, 1], that is ``scale`` times smaller than the whole one.
+    """Find SIFT keypoints of a picture, grey in [0, 1], that is ``scale`` times smaller than the whole one.
 
-    ``pooled``: what they look like is the mean over several sizes of their surroundings.
+    ``pooled``: descriptors are means over several sizes of the keypoints' surroundings.
     """
     colmap = require_pycolmap()
     options = colmap.FeatureExtractionOptions()

@@ -1,4 +1,4 @@
-"""Cameras of photographs, into the folder where they lie."""
+"""The verb ``cameras``: finds the cameras of photographs and writes them into the photographs' folder."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ FEW_OBSERVATIONS = 100
 """Observations a picture below which a model is warned of: with 49, cameras of a noisy capture were off by 4.8 % in the
 median, 26 % at most, before they were refined."""
 KEPT_FOLDER, KEY = ".ctm_cameras", "search.json"
-"""Folder inside the capture for what a stopped search has done, and the file in it that says which search it was."""
+"""Folder inside the capture for a stopped search's results, and the file in it that identifies the search."""
 MAX_NAMES = 5
 """Most names of pictures in a message."""
 
@@ -48,7 +48,7 @@ def cameras(folder: Path, settings: CamerasConfig) -> None:
 
 
 def place(folder: Path, settings: CamerasConfig) -> tuple[list[str], Trusted, float]:
-    """Find the cameras and write them, see :func:`cameras`.
+    """Find a capture's cameras and write COLMAP's model, see :func:`cameras`.
 
     Returns:
         The photographs' names, COLMAP's model, and the factor on their light that it was found with.
@@ -82,7 +82,7 @@ def place(folder: Path, settings: CamerasConfig) -> tuple[list[str], Trusted, fl
 
 @contextmanager
 def kept(folder: Path, key: str) -> Iterator[Path]:
-    """A folder for what a search has done; it stays only if that is stopped, for the same search, by its ``key``."""
+    """Context with a folder for a search's results; it stays only if that is stopped, for one of the same ``key``."""
     if not (folder / KEY).is_file() or (folder / KEY).read_text("utf-8") != key:
         shutil.rmtree(folder, ignore_errors=True)
         folder.mkdir()
@@ -96,13 +96,13 @@ def kept(folder: Path, key: str) -> Iterator[Path]:
 
 
 def key_of(paths: Sequence[Path], settings: CamerasConfig) -> str:
-    """What a search depends on."""
+    """Key that identifies a search: its photographs and its settings."""
     files = [[str(path), path.stat().st_size, path.stat().st_mtime_ns] for path in paths]
     return json.dumps([__version__, asdict(replace(settings, overwrite=False, threads=1)), files])
 
 
 def tell(root: Path, names: Sequence[str], trusted: Trusted, gain: float) -> None:
-    """Print what was found, where it is and how to go on."""
+    """Print how many cameras were found, where the model is, and the next command."""
     model = trusted.model
     placed = {model.image(number).name for number in model.reg_image_ids()}
     console = output_console()
@@ -122,7 +122,7 @@ def tell(root: Path, names: Sequence[str], trusted: Trusted, gain: float) -> Non
 
 
 def focal_lengths(model: Reconstruction) -> list[str]:
-    """Tell the focal length of each camera, and of how many pictures it is where there are several cameras."""
+    """Word the focal length of each camera of a model; where there are several, with the number of its pictures."""
     counts = Counter(model.image(number).camera_id for number in model.reg_image_ids()).most_common()
     text = []
     for number, count in counts[:MAX_NAMES]:

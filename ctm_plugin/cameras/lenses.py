@@ -1,4 +1,4 @@
-"""Lenses of pictures whose EXIF tells none, separated by the focal length that fits each picture best."""
+"""Lenses of pictures without EXIF, separated by the focal length that fits each picture best."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from jaxtyping import Float64
 from ctm_plugin.cameras.colmap import Reconstruction, adjust, require_pycolmap
 
 MIN_RATIO = 1.15
-"""Ratio of two lenses' focal lengths, at least. Measured: one lens's are within 1.04, in noise 1.25 without a gap."""
+"""Least ratio of two lenses' focal lengths. Measured: one lens's are within 1.04, in noise 1.25 without a gap."""
 MAX_SPREAD = 0.25
 """Largest spread of one lens's focal lengths, as a share of the distance between two lenses, in logarithms."""
 MIN_PICTURES_OF_A_LENS = 3
@@ -22,10 +22,10 @@ def tell_lenses_apart(
 ) -> tuple[Reconstruction, list[float]]:
     """Give each lens a camera of its own, where pictures of one size without a focal length in EXIF have several.
 
-    Each picture of ``silent``, numbers, gets a camera of its own for a while; cameras that stand apart stay.
+    For a while each picture whose number is in ``silent`` gets its own camera; then one camera for each lens is left.
 
     Returns:
-        The model, the same if there is one lens, and the lenses' focal lengths in pixels, then one.
+        The model, unchanged if there is one lens; and the new cameras' focal lengths in pixels.
     """
     own = {view: model.image(view).camera for view in model.reg_image_ids()}
     next_free = max(model.cameras) + 1
@@ -50,8 +50,8 @@ def tell_lenses_apart(
 
 
 def lenses(focal: Float64[np.ndarray, " n"]) -> list[list[int]]:
-    """Numbers of the pictures of each lens, by their focal lengths ``[N]`` in pixels; one list where no lens stands
-    clearly apart.
+    """Group pictures by lens, as lists of indices, by their focal lengths ``[N]`` in pixels; one list where no lens
+    stands clearly apart.
     """
     order = np.argsort(focal)
     logs = np.log(focal[order])
@@ -63,7 +63,7 @@ def lenses(focal: Float64[np.ndarray, " n"]) -> list[list[int]]:
 
 
 def with_cameras(model: Reconstruction, cameras: Mapping[int, Any]) -> Reconstruction:
-    """A copy of a model in which pictures have these ``cameras``, by their numbers."""
+    """Copy a model, with these ``cameras`` for the pictures of these numbers."""
     colmap = require_pycolmap()
     copy = colmap.Reconstruction()
     for camera in {camera.camera_id: camera for camera in cameras.values()}.values():

@@ -1,4 +1,4 @@
-"""Which pictures are compared: all with all where they are few, else those that look alike, and neighbours."""
+"""Choice of the pairs of pictures to match: all pairs of few pictures, else pairs that look alike, and neighbours."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
 NEIGHBOURS = 3
-"""Pictures on each side, by name, that each is compared with; then those 16, 32, 64, ... away."""
+"""Pictures on each side, by name, that a picture is matched with; further ones are 16, 32, 64, ... away."""
 VOTERS, VOTES = 256, 8
-"""Details of a picture that vote, and pictures that each votes for."""
+"""Keypoints of a picture that vote for similar pictures, and pictures that each keypoint votes for."""
 PARTNERS = 15
-"""Pictures that each is compared with for their votes."""
+"""Number of pictures with most votes that each picture is matched with."""
 
 
 def all_pairs(count: int) -> list[tuple[int, int]]:
@@ -24,7 +24,7 @@ def all_pairs(count: int) -> list[tuple[int, int]]:
 
 
 def likely_pairs(looks: Sequence[Float32[Tensor, "n d"]]) -> list[tuple[int, int]]:
-    """Pairs of pictures that show the same thing, most likely: :func:`votes` for one another, or near by name.
+    """Choose pairs of pictures that probably show the same thing: with many :func:`votes`, or near by name.
 
     The ring of names closes captures that go round; steps that double tie passes that lie far apart by name.
 
@@ -42,7 +42,7 @@ def likely_pairs(looks: Sequence[Float32[Tensor, "n d"]]) -> list[tuple[int, int
 
 @torch.inference_mode()
 def votes(looks: Sequence[Float32[Tensor, "n d"]]) -> Int64[Tensor, "v v"]:
-    """How many details of a picture, the row, look more like one of another, the column, than like most pictures'."""
+    """Votes ``[V, V]``: keypoints of picture i, the row, that resemble one of picture j more than most pictures'."""
     padded = pad_sequence(list(looks), batch_first=True)
     given = torch.zeros(len(looks), len(looks), dtype=torch.long)
     for number, own in enumerate(looks):

@@ -1,4 +1,4 @@
-"""Which photographs lie in a folder; it is quick to import, so that a folder that cannot be used is refused at once."""
+"""Listing of a folder's photographs; quick to import, so that a folder that cannot be used is refused at once."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from ctm_plugin.errors import DataError
 MODEL_FOLDER = Path("sparse", "0")
 """Folder inside the capture that ``ctm cameras`` writes its model to."""
 PICTURE_SUFFIXES = (*IMAGE_SUFFIXES, *UNREAD_SUFFIXES, *RAW_SUFFIXES)
-"""Suffixes of pictures, those that are read and those that are only named in a message."""
+"""Suffixes of pictures: formats that are read, and formats that are only named in a message."""
 NO_PHOTOGRAPHS = re.compile(r"\..*|(images?_)?masks?|masks_\d+|depths?|sparse|colmap\w*|runs|left_out", re.IGNORECASE)
-"""Names of folders that hold no photographs of their own."""
+"""Pattern of the names of folders that hold no photographs of a capture."""
 SPLIT_DIGITS = re.compile(r"(\d+)").split
 """Splits a name at its numbers, so that 2 sorts before 10."""
 SYSTEM_FILES = ("Thumbs.db", "desktop.ini")
@@ -28,7 +28,7 @@ SYSTEM_FILES = ("Thumbs.db", "desktop.ini")
 
 
 def below(folder: Path) -> list[Path]:
-    """The files of a folder and its folders in natural order; those of ``NO_PHOTOGRAPHS`` are left out."""
+    """All files below a folder in natural order; folders named as in ``NO_PHOTOGRAPHS`` are skipped."""
     files = []
     for place, folders, names in os.walk(folder, followlinks=True):
         folders[:] = [name for name in folders if not NO_PHOTOGRAPHS.fullmatch(name)]
@@ -37,8 +37,8 @@ def below(folder: Path) -> list[Path]:
 
 
 def home_of(root: Path, name: str) -> Path:
-    """The folder of the photographs in ``root``: of this ``name``; of the usual one, where that is not there, the only
-    folder with some, else ``root``.
+    """The folder of the photographs in ``root``: that called ``name``; if ``name`` is the default and missing, the only
+    folder with photographs, else ``root``.
     """
     place = root / name
     elsewhere = name == DEFAULT_FOLDER and not place.is_dir()
@@ -47,7 +47,7 @@ def home_of(root: Path, name: str) -> Path:
 
 
 def list_photographs(root: Path, name: str) -> list[Path]:
-    """The pictures in :func:`home_of` and below it, by names, numbers as they count, but for what is left out."""
+    """List the pictures in the photographs' folder and below, in natural order, without those of :func:`left_out`."""
     place = home_of(root, name)
     files = below(place)
     paths = [path for path in files if is_picture(path)]
@@ -64,14 +64,14 @@ def list_photographs(root: Path, name: str) -> list[Path]:
 
 
 def added(root: Path, name: str) -> list[str]:
-    """Which photographs were not there when ``ctm cameras`` searched for the cameras of ``root``."""
+    """List the photographs that were added after ``ctm cameras`` searched for the cameras of ``root``."""
     there, home = searched_in(root / MODEL_FOLDER), home_of(root, name)
     names = [path.relative_to(home).as_posix() for path in list_photographs(root, name)] if there else []
     return [each for each in names if each not in there]
 
 
 def too_few(root: Path, place: Path, files: Sequence[Path], count: int) -> DataError:
-    """Say why a folder ``place`` of ``root`` has too few pictures."""
+    """Make the error that says why the folder ``place`` of ``root`` has too few pictures."""
     if not place.is_dir():
         there = ", ".join(sorted(path.name for path in root.iterdir() if path.is_dir())) or "no folders"
         return DataError(root, there, f"photographs in {place.name}; for others, ctm cameras FOLDER pictures=NAME")

@@ -1,4 +1,4 @@
-"""Raw pictures of a capture, developed alike into a folder where its photographs are looked for."""
+"""Development of a capture's raw pictures, all alike, into a folder of its photographs."""
 
 from __future__ import annotations
 
@@ -30,14 +30,14 @@ LEAST_OF_A_SENSOR, MOST_OF_A_SENSOR = 5, 12
 
 
 def develop_raws(root: Path) -> None:
-    """Develop the raw pictures in a folder and those below it to linear light, EXR of half floats, and say so.
+    """Develop the raw pictures in a folder and below it to linear light, EXR of half floats, and print how many.
 
-    All have the white balance that the camera chose for one of them, the median of red to blue. Where exposures differ,
-    shorter ones are brightened to the level of the longest. Pixels that are hot in all pictures of a sensor are
-    repaired. All are developed anew unless all are there.
+    All get the white balance of the picture with the median ratio of red to blue. Where exposures differ, shorter ones
+    are brightened to the level of the longest. Pixels that are hot in all pictures of a sensor are repaired. All are
+    developed anew unless all developed files exist.
 
     Raises:
-        DataError: not one can be developed.
+        DataError: no picture can be developed.
     """
     targets = {path: path.parent / DEVELOPED / f"{path.stem}.exr" for path in below(root) if is_raw(path)}
     if not targets:

@@ -1,4 +1,4 @@
-"""Where pictures see a model's points, to a part of a pixel: what one shows there is laid over what all others show."""
+"""Refinement of a model's observations below a pixel, by aligning each picture's patch with the mean of all others'."""
 
 from __future__ import annotations
 
@@ -18,23 +18,23 @@ from ctm_plugin.show.bars import Update
 BLUR = 0.15
 """Standard deviation of the Gaussian that blurs pictures, as a share of a patch's reach."""
 STEPS = 2
-"""Moves of each patch before cameras are adjusted."""
+"""Gauss-Newton steps of each patch before cameras are adjusted."""
 MAX_STEP, MAX_MOVE = 1.5, 4.0
-"""Pixels that a patch may move at a time, and from where its point should be seen; COLMAP's own bound for points."""
+"""Pixels that a patch may move in a step, and in all from its point's projection; the latter is COLMAP's bound."""
 MIN_ANGLE = 1.5
-"""Degrees between two rays to a point; COLMAP's own bound."""
+"""Least degrees between two rays to a point; COLMAP's own bound."""
 MAX_DOUBT = 0.5
-"""Pixels of standard deviation, by the noise, of a place that counts."""
+"""Largest standard deviation in pixels, by the noise, of a patch's position that is used."""
 
 
 class Sights(NamedTuple):
-    """Where one picture sees points.
+    """Observations of points in one picture, and the patches round them.
 
     Attributes:
-        rows: ``[O]`` of the points.
-        indices: ``[O]`` among the picture's details.
-        middles: ``[O, 2]`` column and row at which it should see them, in pixels.
-        axes: ``[O, 2, 2]`` to where a pixel to the right and one down, in the point's own picture, go in this one.
+        rows: ``[O]`` rows of the observed points.
+        indices: ``[O]`` their indices among the picture's keypoints.
+        middles: ``[O, 2]`` column and row of the points' projections, in pixels.
+        axes: ``[O, 2, 2]`` steps in this picture for a pixel right and a pixel down in the point's reference picture.
     """
 
     rows: Int64[Tensor, " o"]
@@ -44,11 +44,11 @@ class Sights(NamedTuple):
 
 
 class Light(NamedTuple):
-    """What a picture is searched in.
+    """A picture's downscaled luminance, in which keypoints and patches are searched.
 
     Attributes:
-        light: ``[H, W]`` linear, of any unit, sides ``scale`` times smaller than the whole picture's.
-        scale: a whole number.
+        light: ``[H, W]`` linear light of any unit, sides ``scale`` times smaller than the whole picture's.
+        scale: a whole number >= 1.
     """
 
     light: Float32[Tensor, "h w"]
@@ -56,19 +56,19 @@ class Light(NamedTuple):
 
 
 def refine(model: Reconstruction, lights: Sequence[Light], reach: int, rounds: int, threads: int, done: Update) -> None:
-    """Move what pictures see to where they agree, and cameras after it, a few times over.
+    """Refine observations until the pictures' patches agree, then adjust cameras and points, for several rounds.
 
     For picture i and a point, ``sum w (P_i(x + d) - mean_{j != i} P_j(x))^2`` over a patch is made small by steps of
     Gauss and Newton on d (B. Lucas and T. Kanade, IJCAI 1981). Leaving i out keeps its noise out of the mean, which
     has that of many pictures averaged; patches are parallel to one of the pictures.
 
     Args:
-        model: COLMAP's, which changes. Pictures are numbered from 1.
-        lights: of all pictures; each is divided by its mean, so that exposures may differ.
+        model: COLMAP's model, changed in place. Pictures are numbered from 1.
+        lights: luminance of all pictures; each is divided by its mean, so that exposures may differ.
         reach: pixels from the middle of a patch to its side; more for more noise, less where surfaces are not flat.
-        rounds: how often.
-        threads: of the processor's; -1: all.
-        done: called with how many rounds there were.
+        rounds: number of rounds.
+        threads: number of CPU threads; -1: all.
+        done: called with the number of rounds done.
     """
     colmap = require_pycolmap()
     for point in [number for number, each in model.points3D.items() if each.track.length() < MIN_TRACK]:
@@ -92,7 +92,7 @@ def refine(model: Reconstruction, lights: Sequence[Light], reach: int, rounds: i
 
 
 def sights_of(model: Reconstruction, numbers: Sequence[int], scales: Mapping[int, int]) -> dict[int, Sights]:
-    """Where each picture should see the points of these ``numbers``, in pixels of pictures so many times smaller."""
+    """Project the points of these ``numbers`` into each picture, in pixels of pictures downscaled by ``scales``."""
     poses = {view: model.image(view).cam_from_world().matrix() for view in model.reg_image_ids()}
     focal = {view: model.image(view).camera.mean_focal_length() / scales[view] for view in poses}
     seen: dict[int, list[tuple[int, int]]] = defaultdict(list)
@@ -119,7 +119,7 @@ def sights_of(model: Reconstruction, numbers: Sequence[int], scales: Mapping[int
 def moved(
     seen: Mapping[int, Sights], lights: Mapping[int, Float32[Tensor, "h w"]], reach: int
 ) -> dict[int, tuple[Sights, np.ndarray, list[bool]]]:
-    """Where each picture sees the points best, ``[O, 2]`` in pixels, and whether that can be trusted."""
+    """Align each picture's patches: refined positions ``[O, 2]`` in pixels, and whether each can be trusted."""
     side = torch.arange(-reach, reach + 1.0)
     patch = torch.cartesian_prod(side, side).flip(-1)
     bell = torch.exp(-(patch**2).sum(-1) / (2 * (reach / 2) ** 2))
@@ -162,7 +162,7 @@ def moved(
 def looked_up(
     light: Float32[Tensor, "h w"], places: Float32[Tensor, "o p 2"]
 ) -> tuple[Float32[Tensor, "o p"], Bool[Tensor, " o"]]:
-    """Light at columns and rows in pixels, the middle of the first at 0.5; and which rows of places are all inside."""
+    """Interpolate light at columns and rows in pixels, the first centre at 0.5; tell which patches are all inside."""
     height, width = light.shape
     size = torch.tensor([width, height])
     inside = ((places >= 0.5) & (places <= size - 0.5)).flatten(1).all(-1)
@@ -170,7 +170,7 @@ def looked_up(
 
 
 def blurred(light: Float32[Tensor, "h w"], sigma: float) -> Float32[Tensor, "h w"]:
-    """Light blurred by a Gaussian of ``sigma`` pixels."""
+    """Blur light by a Gaussian of standard deviation ``sigma`` pixels."""
     far = round(4 * sigma)
     bell = torch.exp(-(torch.arange(-far, far + 1.0) ** 2) / (2 * sigma**2))
     bell /= bell.sum()

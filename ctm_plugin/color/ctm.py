@@ -53,23 +53,23 @@ class SinusoidalMLP(nn.Module):
 
 
 class Given(NamedTuple):
-    """Colours and latents that a step's losses are computed from."""
+    """Colours and latents that the CTM's losses of a step are computed from."""
 
     latents: list[Tensor]
-    """``[R, k]``, rendered."""
+    """Rendered latents, ``[R, k]`` each."""
     rgb: Tensor
-    """``[R, 3]``, the training colours."""
+    """Training colours of the same rays, ``[R, 3]``."""
     random: Tensor
-    """``[S, 3]`` from U[0, 1], none where ``rand`` weighs nothing."""
+    """Random colours ``[S, 3]`` from U[0, 1], none where the term ``rand`` has weight 0."""
     random_latent: Tensor
-    """``[T, k]`` from U[0, 1], none where ``latent`` weighs nothing."""
+    """Random latents ``[T, k]`` from U[0, 1], none where the term ``latent`` has weight 0."""
 
 
 def five_terms(
     encoder: SinusoidalMLP, decoder: SinusoidalMLP, given: Given, photometric: Photometric, weights: LossWeights,
     reduction: str,
 ) -> tuple[dict[str, Tensor], Tensor]:  # fmt: skip
-    """The terms of :meth:`CTM.losses` by name, those that weigh something, and the encoded training colours."""
+    """Compute the terms of :meth:`CTM.losses` by name, those of weight above 0, and the encoded training colours."""
     latents, rgb, random, random_latent = given
     # All colours go through each network in one batch: small layers cost their launches, not their arithmetic.
     target, encoded_random = encoder(torch.cat([rgb, random])).split([len(rgb), len(random)])
@@ -95,7 +95,7 @@ def five_terms(
 
 
 class CTM(ColorTransform):
-    """Encoder ``f: [0,1]^3 -> [0,1]^k`` and decoder ``g: [0,1]^k -> [0,1]^3``.
+    """Color Transform Module: encoder ``f: [0,1]^3 -> [0,1]^k`` and decoder ``g: [0,1]^k -> [0,1]^3``.
 
     Example:
         >>> ctm = CTM()
@@ -166,5 +166,5 @@ class CTM(ColorTransform):
         return ColorLoss(*five_terms(self.encoder, self.decoder, given, photometric, weights, self.config.reduction))
 
     def cycle_loss(self, rgb: Float[Tensor, "r 3"], uniform: Uniform) -> Tensor:
-        """Sum of only the weighted cycle terms, ``[]``, the objective of pre-training."""
+        """Sum of the weighted cycle terms, ``[]``: the objective of pre-training, without a field."""
         return sum(self.losses([], rgb, Photometric(), uniform).terms.values(), rgb.new_zeros(()))

@@ -23,9 +23,9 @@ Values = Float[Tensor, "*shape"]
 Number = Float[Tensor, ""]
 
 TOP_QUANTILE = 0.999
-"""Share of the colours' largest channels below the level that is encoded as ``top``."""
+"""Quantile of the colours' largest channels that is the scene's level, which is encoded as ``top``."""
 MIN_LEVEL = 1e-3
-"""Least such level: a quarter of an 8-bit step."""
+"""Least level that a scene may have, in sRGB: a quarter of an 8-bit step."""
 
 
 def nonblack(rgb: Float[Tensor, "n 3"], label: str) -> Float[Tensor, "m 3"]:
@@ -46,7 +46,7 @@ def nonblack(rgb: Float[Tensor, "n 3"], label: str) -> Float[Tensor, "m 3"]:
 
 
 def solve(increasing: Callable[[float], float], target: float, low: float, high: float) -> float:
-    """Number > 0 where an increasing function is ``target``, or the nearest bound."""
+    """Solve ``increasing(x) = target`` for x > 0 within bounds; the nearest bound where there is no solution."""
     for _ in range(60):
         middle = math.sqrt(low * high)
         low, high = (middle, high) if increasing(middle) < target else (low, middle)
@@ -59,7 +59,7 @@ def as_given(values: Values, given: Float[Tensor, "*given"]) -> Values:
 
 
 class Ranged(ColorTransform):
-    """``black + top h(c / level)``, h the identity.
+    """Space with latents ``black + top h(c / level)``, h the identity.
 
     The level is the 99.9th percentile of the largest channels of the scene's colours, black ones left out, from 0.001
     to ``brightest``. The gain, ``top / level``, is at least 1: bright scenes stay as they are.
@@ -89,16 +89,16 @@ class Ranged(ColorTransform):
         return as_given(self.unbend(bent, self.level.double()).clamp_max(1.0), latent)
 
     def bend(self, color: Values, level: Number) -> Values:
-        """Colours in [0, level] to [0, 1], and brighter ones beyond."""
+        """Map colours in [0, level] to [0, 1] by the curve h, and brighter ones beyond 1."""
         return color / level
 
     def unbend(self, value: Values, level: Number) -> Values:
-        """And back."""
+        """Undo :meth:`bend`: map [0, 1] to colours in [0, level]."""
         return value * level
 
 
 class Bent(Ranged):
-    """``h(u)``, u the part of the level, ``h(0) = 0``, ``h(1) = 1``, bent so that the scene's median is at 0.5.
+    """Space with a curve h(u), u = c / level, ``h(0) = 0``, ``h(1) = 1``, bent so that the scene's median is at 0.5.
 
     The median is that of all channels of the scene's colours that are not 0. The bend a stays in ``bounds``, which
     begin where it is straight, so that scenes with a bright median are not made darker.
@@ -114,7 +114,7 @@ class Bent(Ranged):
 
     @staticmethod
     def curve(part: Values, a: Number) -> Values:
-        """``h``, increasing in both."""
+        """Evaluate the curve h at ``part`` (u) with bend ``a``; it increases in both."""
         raise NotImplementedError
 
     @staticmethod
@@ -128,7 +128,7 @@ class Bent(Ranged):
         self.a.fill_(self.bend_for(median, self.middle, self.bounds))
 
     def bend_for(self, median: Number, middle: float, bounds: tuple[float, float]) -> float:
-        """Find the bend that brings a median, a part of the level's light, to ``middle``, within bounds."""
+        """Find the bend within bounds that brings a median, given as a share of the level, to ``middle``."""
         return solve(lambda a: float(self.curve(median, torch.tensor(a).double())), middle, *bounds)
 
     def describe(self) -> str:

@@ -18,11 +18,11 @@ C1, C2 = 0.01**2, 0.03**2
 def dssim(image: Float[Tensor, "c h w"], target: Float[Tensor, "c h w"]) -> Float[Tensor, ""]:
     """One minus the mean structural similarity of two pictures under a Gaussian window, sigma 1.5.
 
-    Of windows that lie inside the picture, see :func:`ctm_plugin.metrics.image.ssim`; 0 where it has no room for one.
+    Over windows inside the picture, see :func:`ctm_plugin.metrics.image.ssim`; 0 where no window fits.
 
     Args:
-        image: whose gradient is wanted, of any number of channels.
-        target: counts as constant.
+        image: the picture that gets a gradient, of any number of channels.
+        target: the picture to match, without gradient.
     """
     if min(image.shape[1:]) < WINDOW:
         return 0.0 * image.sum()
@@ -35,7 +35,7 @@ def dssim(image: Float[Tensor, "c h w"], target: Float[Tensor, "c h w"]) -> Floa
 
 
 def window(like: Tensor) -> Float[Tensor, " 11"]:
-    """The window's weights along a row, ``[11]``, which add up to 1."""
+    """Weights of SSIM's Gaussian window along a row, ``[11]``, which add up to 1."""
     places = torch.arange(WINDOW, dtype=like.dtype, device=like.device) - WINDOW // 2
     line = (-places.square() / (2 * SIGMA**2)).exp()
     return line / line.sum()

@@ -30,7 +30,7 @@ def hue_of(rgb: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 class OnDisc(ColorTransform):
     """A space with hue and saturation as Cartesian coordinates ``(1 + s cos h) / 2, (1 + s sin h) / 2``: no jump at 0.
 
-    Put before a class with hue in channel 0 and saturation in channel ``saturation``. Points outside the disc decode as
+    Mixin of a space with hue in channel 0 and saturation in channel ``saturation``. Points outside the disc decode as
     its rim.
     """
 

@@ -21,7 +21,7 @@ from ctm_plugin.errors import ConfigError
 
 
 class Aim(NamedTuple):
-    """Target of a number, and the deviation from it that costs one unit."""
+    """Target of a statistic of lit pictures, and the deviation from it that costs one unit."""
 
     at: float
     within: float
@@ -41,11 +41,11 @@ ROOM_STOPS, ROOM_SPREADS = 3.0, 2.5
 """Distance above the median, in stops and in multiples of the darkest sixth's distance below it, where windows and
 lamps begin."""
 MIN_BRIGHTNESS = 0.05
-"""Least brightness of a square whose saturation counts, as a share of the mean."""
+"""Least brightness of an averaging square whose saturation counts, as a share of the squares' mean."""
 STOPS, CONTRASTS = torch.arange(0, MAX_STOPS + 0.01, 0.04).double(), 1 + 0.02 * torch.arange(33).double()
-"""Stops and contrasts that the search tries."""
+"""Stops and contrasts that the search for a scene's light tries."""
 QUANTILES = 512
-"""Number of quantiles that stand for all values."""
+"""Number of quantiles that stand for all linear values of a scene."""
 SQUARES_ACROSS = 94
 """Number of averaging squares along a picture's shorter side; they average noise out."""
 HISTOGRAM_BINS = 65536
@@ -57,7 +57,7 @@ KNEE = 0.5
 MIN_GAIN = 2.0**0.5
 """Least gain that is applied, half a stop: pictures that need less were lit."""
 WHITE_QUANTILE = 0.99
-"""Share of the values below white."""
+"""Quantile of a test set's values that the enhancement gain brings to white."""
 BISECTIONS = 60
 """Number of steps of a bisection, down to float64's rounding."""
 
@@ -102,7 +102,7 @@ AS_IS = Light()
 
 
 def chosen_light(settings: LightConfig, auto: Light) -> Light:
-    """The light that settings mean, where ``auto`` was found for the scene."""
+    """Resolve settings to a light; ``auto`` is the light that was found for the scene."""
     stops = stops_of(settings.light)
     base = auto if stops is None else Light(2.0**stops)
     return Light(
@@ -113,7 +113,7 @@ def chosen_light(settings: LightConfig, auto: Light) -> Light:
 
 
 def saturated(light: Float[Tensor, "*shape 3"], saturation: float) -> Float[Tensor, "*shape 3"]:
-    """Linear light as far from its grey as ``saturation`` says, in times; below 0 it is cut off."""
+    """Multiply linear light's distance from grey by ``saturation``; negative light is cut to 0."""
     if saturation == 1:
         return light
     grey = (light @ light.new_tensor(LUMINANCE))[..., None]
@@ -121,7 +121,7 @@ def saturated(light: Float[Tensor, "*shape 3"], saturation: float) -> Float[Tens
 
 
 def contrasted(srgb: Float[Tensor, "*shape"], contrast: float) -> Float[Tensor, "*shape"]:
-    """``t^k / (t^k + (1 - t)^k)``, of t in [0, 1]; undone by 1 / k."""
+    """Apply contrast k to sRGB t in [0, 1]: ``t^k / (t^k + (1 - t)^k)``; contrast 1 / k undoes it."""
     if contrast == 1:
         return srgb
     bright = srgb**contrast
@@ -202,7 +202,7 @@ def enhancement_gain(
 def find_light(
     colors: UInt8[Tensor, "*shape c"] | Float[Tensor, "*shape c"], mask: Bool[Tensor, "*shape"] | None = None
 ) -> Light:
-    """Find the light that suits dark pictures, from themselves; none for those that are lit, or nearly.
+    """Find the light to display dark pictures in, from their colours; no change for those that are lit, or nearly.
 
     Saturation S is the mean of 1 - least / largest channel; ``saturation = 0.45 / S``, in [1, 1.25]. Gain g and
     contrast k minimise, over what the pictures become::
@@ -216,7 +216,7 @@ def find_light(
         colors, mask: see :func:`squares`.
 
     Returns:
-        One that changes nothing, or brightens by at least half a stop (1.41).
+        A light that changes nothing, or brightens by at least half a stop (1.41).
     """
     light, counts = squares(colors, mask)
     kept = room(light, counts)
@@ -246,8 +246,8 @@ def find_light(
 def room(light: Float[Tensor, "s 3"], counts: Float64[Tensor, " s"]) -> Bool[Tensor, " s"]:
     """Tell squares of linear light from windows and lamps: these may become white, as in a photograph of the room.
 
-    What stays has at most the luminance ``m 2^max(3, 2.5 log2(m / d))``. m is the median and d the 16th percentile of
-    all that have light, as often as ``counts`` says. The second number keeps what is bright in scenes of many stops.
+    The room's squares have at most luminance ``m 2^max(3, 2.5 log2(m / d))``: m is the median and d the 16th percentile
+    of squares with light, weighted by ``counts``. The second number keeps what is bright in scenes of many stops.
     """
     luminance = light @ light.new_tensor(LUMINANCE)
     lit = luminance > 0
@@ -262,14 +262,14 @@ def room(light: Float[Tensor, "s 3"], counts: Float64[Tensor, " s"]) -> Bool[Ten
 def squares(
     colors: UInt8[Tensor, "*shape c"] | Float[Tensor, "*shape c"], mask: Bool[Tensor, "*shape"] | None = None
 ) -> tuple[Float[Tensor, "s 3"], Float64[Tensor, " s"]]:
-    """Linear light averaged over squares of pictures ``[N, H, W, C]``, of other colours each by itself.
+    """Average linear light over squares of pictures ``[N, H, W, C]``; colours of other shapes are not averaged.
 
     Args:
         colors: sRGB, C = 3, or 4 with straight alpha: pixels with alpha > 0 count. Bytes, or floats in [0, 1].
         mask: which pixels count; ``None``: all do.
 
     Returns:
-        Those that hold such pixels, and how many. Rows and columns that fill no square are left out.
+        Light of squares with pixels that count, and their number. Rows and columns that fill no square are left out.
     """
     table = srgb_to_linear(torch.arange(256) / 255)
     batched = colors.ndim == 4
@@ -298,7 +298,7 @@ def squares(
 
 
 def tiled(values: Float[Tensor, "h w c"], side: int) -> Float[Tensor, "rows columns c"]:
-    """Sums over squares of so many pixels."""
+    """Sum values over squares of ``side`` x ``side`` pixels."""
     height, width, channels = values.shape[0] // side, values.shape[1] // side, values.shape[2]
     whole = values[: height * side, : width * side]
     rows = whole.reshape(height, side, width * side, channels).sum(1)

@@ -1,4 +1,4 @@
-"""What comes before a transform and a field are trained together, and the transform's own optimizer."""
+"""Fit and pre-training of a transform, before it trains with a field, and the transform's own optimizer."""
 
 from __future__ import annotations
 
@@ -31,13 +31,13 @@ def prepare(
 ) -> None:  # fmt: skip
     """Fit a transform to the scene, then pre-train it, as its ``learning`` says.
 
-    The latter minimises the cycle terms on training colours. All of it is the same on every process.
+    Pre-training minimises the cycle terms on training colours. The result is the same on every process.
 
     Args:
         transform: on ``device``.
         optimizer: the transform's own, of one parameter group; ``None`` where it has no parameters.
         colors: ``colors(draws, count)``, ``[count, 3]``: random training colours as evaluation shows them.
-        seed, device: of the random numbers.
+        seed, device: seed and device of the random numbers.
 
     Raises:
         ConfigError: all cycle terms weigh nothing.

@@ -125,7 +125,7 @@ class LossWeights(Settings, section="ctm.weights"):
 
 @dataclass(frozen=True, kw_only=True)
 class CTMConfig(Settings, section="ctm"):
-    """Size and losses of CTM. The defaults are the paper's, which does not give ``init``."""
+    """Size and losses of CTM. The defaults are the paper's, but for ``init``, which it does not give."""
 
     k: int = setting(3, "number of latent channels", least=1)
     P: int = setting(4, "frequencies of the colour embedding; 0: the plain colour", least=0)

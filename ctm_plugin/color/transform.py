@@ -45,8 +45,8 @@ class ColorTransform(nn.Module):
         channels: k, the number of latent channels the field has to render.
         label: how the command line chose it, for messages.
         learning: how it is trained, where it has parameters.
-        filled: the scene's colours are latents from the first to the second; backgrounds that pictures get as well as
-            renderings are drawn from there.
+        filled: lowest and highest latent of the scene's colours; random backgrounds behind pictures and renderings
+            are drawn from that range.
     """
 
     Config: type = Nothing
@@ -61,15 +61,15 @@ class ColorTransform(nn.Module):
 
     @property
     def behind(self) -> Ends:
-        """(low, high) latents for backgrounds behind renderings only."""
+        """Lowest and highest latent of random backgrounds that lie behind renderings only."""
         return self.filled
 
     def begin(self, rgb: Float[Tensor, "n 3"]) -> None:
         """Fit the transform to some of the scene's training colours, once, before anything is trained. Most have
         nothing to fit.
 
-        What is found goes into buffers (``register_buffer``): checkpoints hold them, and no run that goes on, or is
-        rendered, is fitted again.
+        The fit goes into buffers (``register_buffer``): checkpoints hold them, so that a resumed or rendered run is
+        not fitted again.
         """
 
     def describe(self) -> str | None:
@@ -146,10 +146,10 @@ class Chain(ColorTransform):
 
 @torch.no_grad()
 def fitted(transform: ColorTransform, rgb: Float[Tensor, "n 3"]) -> Float[Tensor, "n k"]:
-    """Let a transform :meth:`~ColorTransform.begin` with some of a scene's colours; these, encoded by it.
+    """Fit a transform to a scene's colours (:meth:`~ColorTransform.begin`), and give these colours encoded by it.
 
     Raises:
-        CTMError: it makes other shapes of them than its ``channels`` say, or what is no number.
+        CTMError: the encoded colours do not have the transform's ``channels``, or are not finite.
     """
     transform.begin(rgb)
     latent = transform.encode(rgb)

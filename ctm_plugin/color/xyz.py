@@ -29,7 +29,7 @@ def from_xyz(xyz: list[Tensor]) -> Tensor:
 
 
 def _product(matrix: tuple[tuple[float, ...], ...], vector: list[Tensor]) -> list[Tensor]:
-    """Written out, because a matrix product obeys autocast and TF32."""
+    """Multiply matrix and vector, written out because torch's matrix product obeys autocast and TF32."""
     return [sum(weight * value for weight, value in zip(row, vector, strict=True)) for row in matrix]
 
 

@@ -1,1 +1,1 @@
-"""What makes a CPU fast; :mod:`ctm_plugin.door` is where functions of other rooms meet their loops."""
+"""Compiled loops in place of torch functions on a CPU; :mod:`ctm_plugin.door` decides which of the two runs."""

@@ -1,4 +1,4 @@
-"""Adam of the rows of a table that have a gradient, in one pass through memory."""
+"""Loop of Adam for the rows of a table that have a gradient, in one pass through memory."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ def step_table(
     table: Tensor, grad: Tensor, exp_avg: Tensor, exp_avg_sq: Tensor, rates: Tensor | None, step: int,
     lr: float, betas: tuple[float, float], eps: float,
 ) -> None:  # fmt: skip
-    """Do as :func:`ctm_plugin.optim.grid_adam.step_table`; of a sparse gradient only the named rows are gone through.
+    """Step a table by Adam in place (:func:`ctm_plugin.optim.grid_adam.step_table`); a sparse gradient's rows only.
 
     Raises:
         ValueError: shapes do not fit.
@@ -34,7 +34,7 @@ def step_table(
 
 
 def _rows_of(grad: Tensor) -> tuple[Tensor, Tensor]:
-    """Rows and values of a sparse gradient, no row twice."""
+    """Rows ``[N]`` and values ``[N, c]`` of a sparse gradient, duplicate rows added up."""
     rows = grad._indices()[0]
     # Autograd forgets that a gradient is coalesced, and to sort it again takes longer than the step.
     if not (rows[1:] > rows[:-1]).all():
@@ -48,7 +48,7 @@ ROW_BLOCK = 1024
 
 @inlined
 def _step(table, exp_avg, exp_avg_sq, row, c, change, rate, numbers):
-    """Step one number (Kingma & Ba, ICLR 2015), its moments with it."""
+    """Step one number of a table, and its moments, by Adam (Kingma & Ba, ICLR 2015)."""
     first = exp_avg[row, c] + (change - exp_avg[row, c]) * numbers[0]
     second = exp_avg_sq[row, c] * numbers[1] + change * change * numbers[2]
     exp_avg[row, c] = first
@@ -58,7 +58,7 @@ def _step(table, exp_avg, exp_avg_sq, row, c, change, rate, numbers):
 
 @compiled("void(f4[:,::1], f4[:,::1], f4[:,::1], i8[::1], f4[:,::1], f4[:,::1], f4[::1])")
 def adam_rows(table, exp_avg, exp_avg_sq, rows, grad, rates, numbers):
-    """Step ``rows`` by ``grad``; a row of zeros in it rests, moments included.
+    """Step a table's ``rows`` by Adam with ``grad``; rows of zero gradient rest, moments included.
 
     Args:
         table, exp_avg, exp_avg_sq: ``[V, c]``, changed in place.

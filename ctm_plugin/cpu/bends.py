@@ -1,4 +1,4 @@
-"""How far rendered surfaces are from planes, with its gradient: a pass over centres, and one that gathers."""
+"""Loop of the loss on bends of rendered surfaces, with its gradient: a pass over centres, and one that gathers."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ NEAR, FAR = STRIDES
 
 
 def bends(inverse: Tensor, stopped: Tensor, colors: Tensor) -> Tensor:
-    """Do as :func:`ctm_plugin.splats.render.bends`."""
+    """Measure how far rendered surfaces are from planes, see :func:`ctm_plugin.splats.render.bends`."""
     return Bends.apply(inverse, stopped, colors)
 
 
 class Bends(torch.autograd.Function):
-    """The measure; its gradient is found with it."""
+    """Autograd function of :func:`bends`, which computes the gradient together with the loss."""
 
     @staticmethod
     def forward(ctx: Any, inverse: Tensor, stopped: Tensor, colors: Tensor) -> Tensor:
@@ -69,7 +69,7 @@ def _exp(p):
 
 @fused_part
 def _folds(before, here, after, first, middle, last, one, other, pull, scale, count):
-    """Sum up how far a row of centres is from planes; ``pull`` is left with the slopes of their second differences.
+    """Sum the weighted second differences of inverse depth over a row of centres; ``pull`` gets their slopes.
 
     ``first``, ``middle`` and ``last`` are the colours ``[k, count]``; ``one`` and ``other`` are room for a row.
     """

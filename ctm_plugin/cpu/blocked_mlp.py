@@ -1,4 +1,4 @@
-"""An MLP on a CPU: the same numbers to rounding, in blocks of rows that stay in the cache."""
+"""An MLP on a CPU in blocks of rows that stay in the cache; results equal torch's to rounding."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ number of columns take half as long again."""
 
 @runtime_checkable
 class Entry(Protocol):
-    """Makes the first layer's input of a table ``[N, D]``, a block of rows at a time."""
+    """Protocol of the first layer's input, made of a table ``[N, D]``, a block of rows at a time."""
 
     def enter(self, table: Tensor, at: slice, out: Tensor) -> None:
         """Write the input ``[n, E]`` of the table's rows ``at``, of which it gets only those; ``out`` has the
@@ -42,15 +42,15 @@ def blocked_mlp(
 
     Args:
         table: ``[N, D]``.
-        entry: to the first layer.
+        entry: makes the first layer's input of the table's rows.
         weights, biases: of all layers, ``[out, in]`` and ``[out]``, at least two.
-        sigmoid: whether there is one.
+        sigmoid: whether a sigmoid follows the last layer.
     """
     return _BlockedMLP.apply(table, entry, product_dtype(table), torch.is_grad_enabled(), sigmoid, *weights, *biases)
 
 
 def product_dtype(table: Tensor) -> torch.dtype:
-    """Tell the type that products with a table ``[N, D]`` are to have: autocast's where it is on, else the table's."""
+    """Dtype of products with a table ``[N, D]``: autocast's where it is on, else the table's."""
     return torch.get_autocast_dtype("cpu") if torch.is_autocast_enabled("cpu") else table.dtype
 
 
@@ -118,7 +118,7 @@ def _sums(grad: Tensor) -> Tensor:
 
 
 def _blocks(rows: int, weights: Sequence[Tensor]) -> list[tuple[slice, int]]:
-    """The rows of each block, and how many they are when filled up."""
+    """Split ``rows`` into blocks: each block's slice, and its number of rows with padding."""
     size = max(1, BLOCK_BYTES // max(weight[0].nbytes for weight in weights) // ROW_MULTIPLE) * ROW_MULTIPLE
     blocks = [slice(start, min(start + size, rows)) for start in range(0, rows, size)]
     return [(block, math.ceil((block.stop - block.start) / ROW_MULTIPLE) * ROW_MULTIPLE) for block in blocks]

@@ -1,4 +1,4 @@
-"""Functions of tensors as machine code for this CPU, without a compiler on the machine."""
+"""Compilation of functions of tensors by numba, with a cache, for this CPU."""
 
 from __future__ import annotations
 
@@ -41,12 +41,12 @@ def compiled(signature: str, fused: bool = False, parallel: bool = True) -> Call
     cache.
 
     Args:
-        signature: the only types it takes, in numba's words.
+        signature: types of the arguments, the only ones accepted, as a numba signature.
         fused: let sums be reordered, and products rounded together with them, as libraries of matrix products do.
         parallel: run ``prange`` loops on several threads.
 
     Raises:
-        TypeError: when called with others, tensors that are not contiguous among them.
+        TypeError: when called with arguments of other types, or tensors that are not contiguous.
     """
 
     def decorate(function: Callable) -> Callable:
@@ -69,25 +69,25 @@ def compiled(signature: str, fused: bool = False, parallel: bool = True) -> Call
 
 
 def inlined(function: Callable) -> Callable:
-    """Make a function a part of compiled ones, which it is written into."""
+    """Decorate a function to be inlined into compiled functions."""
     return numba.njit(inline="always")(inspect.unwrap(function))
 
 
 def fused_part(function: Callable) -> Callable:
-    """Make a function one that compiled ones call, itself compiled with them as with ``fused``."""
+    """Decorate a function to be called by compiled functions, compiled with them, with the math of ``fused``."""
     options = {"error_model": "numpy", "fastmath": FUSED, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
     return numba.njit(**options)(inspect.unwrap(function))
 
 
 @functools.cache
 def _announce() -> None:
-    """Tell, once, what the first step waits for."""
+    """Print once that the first step waits for compilation."""
     print("compiling loops for this processor, once; it takes half a minute", file=sys.stderr, flush=True)
 
 
 @functools.cache
 def _start_threads() -> None:
-    """Start numba's threads, which under OpenMP sets how many torch uses, and set that back."""
+    """Start numba's threads; under OpenMP that changes torch's number of threads, which is restored."""
     threads = torch.get_num_threads()
     numba.get_num_threads()
     torch.set_num_threads(threads)
@@ -95,18 +95,18 @@ def _start_threads() -> None:
 
 @functools.cache
 def _not_kept(folder: Path, kind: type[Exception]) -> None:
-    """Tell, once, what every process waits for."""
+    """Warn once that compiled code cannot be kept, so that every process compiles anew."""
     warnings.warn(f"compiled loops cannot be kept in {folder} ({kind.__name__}): each run compiles anew", stacklevel=3)
 
 
 def _of_what_is_kept(error: Exception) -> bool:
-    """Whether a folder cannot be written to, has no locks, or holds a damaged file: unpickling says anything."""
+    """Whether an error comes from the cache: a folder that is not writable or lockable, or a damaged file in it."""
     places = [frame.f_code.co_filename for frame, _ in traceback.walk_tb(error.__traceback__)]
     return isinstance(error, OSError | NotImplementedError) or caching.__file__ in places
 
 
 def _machine_code(function: Callable, signature: str, fused: bool, parallel: bool) -> Callable:
-    """Compiled, or loaded if it has been compiled before; where it cannot be kept, compiled anew, with a warning.
+    """Compile a function, or load its code from the cache; where it cannot be kept, compile anew, with a warning.
 
     One process at a time: numba's files, written by several at once, may end with one function's code under the key of
     another.

@@ -1,4 +1,4 @@
-"""Structural dissimilarity with its gradient, in one pass over bands of rows."""
+"""Loop of structural dissimilarity (D-SSIM) with its gradient, in one pass over bands of rows."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ W0, W1, W2, W3, W4, W5 = (np.float32(value) for value in _line / (2 * _line.sum(
 
 
 def dssim(image: Tensor, target: Tensor) -> Tensor:
-    """Do as :func:`ctm_plugin.color.dssim.dssim`."""
+    """One minus the mean SSIM of two pictures, see :func:`ctm_plugin.color.dssim.dssim`."""
     return DSSIM.apply(image, target)
 
 
 class DSSIM(torch.autograd.Function):
-    """The loss; its gradient is found with it."""
+    """Autograd function of :func:`dssim`, which computes the gradient together with the loss."""
 
     @staticmethod
     def forward(ctx: Any, image: Tensor, target: Tensor) -> Tensor:
@@ -78,7 +78,7 @@ def _across(rows, y, into, count):
 
 @fused_part
 def _products(x, z, into, count):
-    """The squares of two rows, and their product."""
+    """Write the squares of two rows of pixels, and their product."""
     for i in range(count):
         into[0, i], into[1, i], into[2, i] = x[i] * x[i], z[i] * z[i], x[i] * z[i]
 
@@ -109,7 +109,7 @@ def compare(a, b, scale, sums, grad):
 
     Args:
         a, b: the pictures.
-        scale: of the gradient.
+        scale: factor on the gradient.
         sums: ``[C, H - 10]``, left with the sum of the similarities of each row of windows.
         grad: ``[C, H, W]``, left with the gradient in ``a``.
     """

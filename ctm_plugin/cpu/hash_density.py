@@ -22,7 +22,7 @@ ZERO, ONE = np.float32(0), np.float32(1)
 MAX_LOG = np.float32(15)
 """Largest logarithm of a density, as in :mod:`ctm_plugin.rays.hash_density`."""
 TILE_SAMPLES = 256
-"""Most samples of a tile."""
+"""Most samples in a tile, the batch that goes through the network at once."""
 SAMPLE_MULTIPLE = 32
 """Tiles are padded to a multiple of this: two registers of AVX-512."""
 STRIDE = TILE_SAMPLES + 16
@@ -38,7 +38,7 @@ PARTS_PER_THREAD = 4
 def log_density(
     table: Tensor, sides: Tensor, starts: Tensor, first: nn.Linear, last: nn.Linear, points: Tensor
 ) -> Tensor:
-    """Do as :func:`ctm_plugin.rays.hash_density.log_density`."""
+    """Logarithm of the density ``[M]`` at points, see :func:`ctm_plugin.rays.hash_density.log_density`."""
     density = points.new_empty(len(points))
     _log_density(table, points.T.contiguous(), sides, starts, *_network(first, last), density, torch.get_num_threads())
     return density
@@ -48,7 +48,7 @@ def lit(
     table: Tensor, sides: Tensor, starts: Tensor, first: nn.Linear, last: nn.Linear, points: Tensor,
     lengths: Tensor, ray_index: Tensor, n_rays: int, threshold: float,
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
-    """Do as :func:`ctm_plugin.rays.hash_density.lit`, along each ray no further than light goes."""
+    """Find samples that light reaches (:func:`ctm_plugin.rays.hash_density.lit`), on each ray as far as light goes."""
     ends = torch.searchsorted(ray_index, torch.arange(n_rays + 1))
     marked, features = torch.zeros(len(points), dtype=torch.bool), table.new_empty(len(points), first.in_features)
     least = -math.log1p(-threshold)  # optical depth of such an alpha
@@ -59,12 +59,12 @@ def lit(
 
 
 def _network(first: nn.Linear, last: nn.Linear) -> tuple[np.ndarray, Tensor, Tensor]:
-    """How many numbers enter each layer, and their matrices, the last one's of its first number only."""
+    """Input sizes of the two layers, and their matrices; of the last layer only the first output's."""
     return np.array([first.in_features, first.out_features]), _matrix(first, first.out_features), _matrix(last, 1)
 
 
 def _matrix(layer: nn.Linear, outer: int) -> Tensor:
-    """The weights of so many outputs, with biases as the column of the ones; products go four by four."""
+    """Weight matrix of a layer's first ``outer`` outputs, with the biases as a column, padded to multiples of four."""
     inner = layer.in_features
     matrix = torch.zeros((outer + 4) // 4 * 4, (inner + 4) // 4 * 4)
     matrix[:outer, :inner], matrix[:outer, inner] = layer.weight[:outer].detach(), layer.bias[:outer].detach()
@@ -80,7 +80,7 @@ def _clear(tile, rows, width):
 
 @fused_part
 def _tiles(sizes, first, last):
-    """Make the tiles of what enters both layers, and of what leaves them."""
+    """Allocate the tiles of both layers' inputs and of the last layer's output."""
     entered, hidden = (np.empty((first.shape[1], STRIDE), np.float32), np.empty((last.shape[1], STRIDE), np.float32))
     for tile, size in ((entered, sizes[0]), (hidden, sizes[1])):
         _clear(tile[size:], len(tile) - size, TILE_SAMPLES)
@@ -91,7 +91,7 @@ def _tiles(sizes, first, last):
 
 @fused_part
 def _times(weight, values, rows, steps, width, relu, out):
-    """Multiply: ``out = weight values``, or ReLU of it, of so many columns of the weight.
+    """Multiply ``out = weight values``, or its ReLU, for ``width`` samples and the weight's first ``steps`` columns.
 
     Four rows and four columns of the weight at a time, which stay in registers while LLVM goes along the samples.
     """
@@ -119,7 +119,7 @@ def _times(weight, values, rows, steps, width, relu, out):
 
 @fused_part
 def _encode(table, points, sides, starts, index, count, width, tile):
-    """Write the features of so many points, of those in ``index``, side by side; 0 up to ``width``."""
+    """Write the features of ``count`` points, chosen by ``index``, side by side into a tile; 0 up to ``width``."""
     for level in range(len(sides)):
         side, start = sides[level], starts[level]
         layout = layout_of(side, starts[level + 1] - start)
@@ -133,7 +133,7 @@ def _encode(table, points, sides, starts, index, count, width, tile):
 
 @fused_part
 def _evaluate(table, points, sides, starts, sizes, first, last, index, count, tiles):
-    """Give the network's first number for so many points, side by side."""
+    """Evaluate the network's first output, the log density, for ``count`` points, side by side."""
     entered, hidden, out = tiles
     width = (count + SAMPLE_MULTIPLE - 1) // SAMPLE_MULTIPLE * SAMPLE_MULTIPLE
     _encode(table, points, sides, starts, index, count, width, entered)

@@ -1,4 +1,4 @@
-"""Lookups in multiresolution hash grids of two features a vertex, and their gradient: see ``rays/hash_grid.py``."""
+"""Loops of lookups in hash grids of two features a vertex, and their gradient: see ``rays/hash_grid.py``."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from ctm_plugin.cpu.compiled import compiled, inlined
 FEATURES = 2
 """Features a row of the tables."""
 PRIME_Y, PRIME_Z = 2654435761, 805459861
-"""Primes that the second and third coordinate of a vertex are multiplied by."""
+"""Primes of the spatial hash, for the second and third coordinate of a vertex."""
 
 
 def encoded(table: Tensor, points: Tensor, sides: Tensor, starts: Tensor) -> Tensor:
-    """Do as :func:`ctm_plugin.rays.hash_grid.encoded`, a level of a part of the points after the other: its table stays
-    in the cache.
+    """Look up hash-grid features (:func:`ctm_plugin.rays.hash_grid.encoded`), level by level for parts of the points: a
+    level's table stays in the cache.
     """
     out = table.new_empty(len(points), FEATURES * len(sides))
     _gather(table, points.T.contiguous(), sides, starts, out, torch.get_num_threads())
@@ -25,7 +25,7 @@ def encoded(table: Tensor, points: Tensor, sides: Tensor, starts: Tensor) -> Ten
 
 
 def spread(grad: Tensor, points: Tensor, sides: Tensor, starts: Tensor, shape: torch.Size) -> Tensor:
-    """Do as :func:`ctm_plugin.rays.hash_grid.spread`, in the order of the points; a level is one thread's."""
+    """Add up features' gradient (:func:`ctm_plugin.rays.hash_grid.spread`) in the points' order, a thread a level."""
     sums = grad.new_zeros(shape)
     _scatter(grad.contiguous(), points.T.contiguous(), sides, starts, sums)
     return sums
@@ -42,7 +42,7 @@ def _cell(x, side):
 
 @inlined
 def layout_of(side, rows):
-    """Whether a level has a row for each vertex, the mask of its rows, and what y and z are multiplied by."""
+    """Layout of a level: whether each vertex has its own row, the mask of its rows, and the factors of y and z."""
     dense = (side + 1) ** 3 <= rows
     along_y = side + 1 if dense else np.int64(PRIME_Y)
     along_z = (side + 1) ** 2 if dense else np.int64(PRIME_Z)
@@ -51,7 +51,7 @@ def layout_of(side, rows):
 
 @inlined
 def _row(start, x, y, z, dense, mask):
-    """A vertex's row; unsigned, as others are asked whether they count from the end, which takes half as long again."""
+    """Row of a vertex; unsigned, as others are tested for counting from the end, which takes half as long again."""
     return np.uint64(start + (x + y + z if dense else (x ^ y ^ z) & mask))
 
 
@@ -77,7 +77,7 @@ def _corner(place, start, layout, k, j, i):
 
 @inlined
 def looked_up(table, points, m, side, start, layout):
-    """Both features of a point, of ``[3, M]``, in a level whose rows begin at ``start``."""
+    """Look up both features of point m of ``points`` ``[3, M]`` in a level whose rows begin at ``start``."""
     place = _placed(points, m, side)
     first, second = np.float32(0), np.float32(0)
     for k in range(2):

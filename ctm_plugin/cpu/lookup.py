@@ -1,4 +1,4 @@
-"""Trilinear lookups of one channel, and the gradient of any: each row's contributions, in the order of the points."""
+"""Loops of trilinear lookups of one channel, and of the gradient of any number of channels."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ ROW_BLOCK = 256
 LOG2_OWNED_ROWS = 12
 """log2 of contiguous rows per thread: a ray stays within them for a while, which branch prediction likes."""
 SERIAL_NUMBERS = 1 << 19
-"""Most numbers that one thread adds faster than several find their own."""
+"""Most numbers that one thread adds up faster than several threads, each of which searches for its own rows."""
 
 
 SPARSE_FACTOR = 5
@@ -39,7 +39,7 @@ def _numbers_at(table, rows, weights, values):
 
 
 def gradient(rows: Tensor, weights: Tensor, grad: Tensor, shape: torch.Size, sparse: bool) -> Tensor:
-    """Do as :func:`ctm_plugin.rays.grid.scattered`, row by row; ``sparse`` where few rows are used."""
+    """Add up a table's gradient (:func:`ctm_plugin.rays.grid.scattered`); ``sparse`` where few rows are used."""
     rows = rows.int()
     if sparse and SPARSE_FACTOR * rows.numel() < shape.numel():
         touched, sums = sums_of_rows(rows, weights, grad, shape[0])
@@ -65,7 +65,7 @@ def sums_of_rows(rows: Tensor, weights: Tensor, grad: Tensor, count: int) -> tup
 
 
 def add_rows(rows: Tensor, weights: Tensor, grad: Tensor, index: Tensor, sums: Tensor) -> None:
-    """Add ``weights[m, i] grad[m]`` to ``sums[index[rows[m, i]]]`` in place; no ``index``: of the rows themselves."""
+    """Add ``weights[m, i] grad[m]`` to ``sums[index[rows[m, i]]]`` in place; empty ``index``: ``sums[rows[m, i]]``."""
     parts = 1 << torch.get_num_threads().bit_length() - 1
     few = grad.shape[1] == 1 and sums.numel() < SERIAL_NUMBERS
     _add(rows, weights, grad.contiguous(), index, sums, 1 if few else parts)
@@ -111,7 +111,7 @@ def _touched(rows, touched, index):
 def _add(rows, weights, grad, index, sums, parts):
     """Each of ``parts`` threads, a power of two of them, goes through all corners and adds up rows of its own.
 
-    So no two write to one row, and the order is that of the points however many they are.
+    So no two threads write to one row, and sums are in the order of the points for any number of threads.
     """
     for part in prange(parts):
         for m in range(rows.shape[0]):

@@ -1,4 +1,4 @@
-"""Float32 products of matrices on a CPU: by the library that is faster, where it is as exact."""
+"""Choice of the library for float32 matrix products on a CPU: oneDNN, where it is as exact as MKL."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ MAX_ERROR = 2e-6
 
 @contextmanager
 def fast_products(device: torch.device) -> Iterator[bool]:
-    """Let oneDNN multiply float32 matrices on the CPU inside, instead of MKL, if that loses nothing.
+    """Context in which oneDNN multiplies float32 matrices on the CPU, instead of MKL, if that loses no precision.
 
     MKL uses AVX-512 only on its maker's processors; oneDNN uses it on all, and is twice as fast on others. torch asks
     oneDNN only where float32 products may be rounded to bfloat16 inside (``set_float32_matmul_precision("medium")``).
@@ -41,7 +41,7 @@ def fast_products(device: torch.device) -> Iterator[bool]:
 
 @cache
 def _exact(threads: int) -> bool:
-    """Whether products lose nothing, as torch is set now; tried out once for a number of threads."""
+    """Whether float32 products are exact under torch's present settings; tested once for each number of threads."""
     return max(product_error(*shape) for shape in PRODUCT_SHAPES) < MAX_ERROR
 
 

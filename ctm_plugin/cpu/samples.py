@@ -28,10 +28,10 @@ def occupied_samples(
     origins: Tensor, directions: Tensor, first: Tensor, counts: Tensor, step: float, occupancy: Tensor,
     low: Tensor, scale: Tensor, last: Tensor, offsets: Tensor, contracted: bool = False,
 ) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
-    """Do as :func:`ctm_plugin.rays.occupancy.occupied_samples`; no table is made of the samples that are dropped.
+    """Find samples in occupied cells (:func:`ctm_plugin.rays.occupancy.occupied_samples`), without storing others.
 
     Raises:
-        ValueError: a count is negative, as of rays that are no numbers.
+        ValueError: a count is negative, as for rays with NaN.
     """
     if len(counts) and counts.min() < 0:
         raise ValueError(f"{int(counts.min())} samples on a ray: is it a number?")
@@ -48,7 +48,7 @@ def occupied_samples(
 
 
 def corners(points: Tensor, low: Tensor, scale: Tensor, last: Tensor, offsets: Tensor) -> tuple[Tensor, Tensor]:
-    """Do as :func:`ctm_plugin.rays.grid.corners`."""
+    """Find rows and weights ``[M, 8]`` of the vertices round points, see :func:`ctm_plugin.rays.grid.corners`."""
     rows, weights = points.new_empty(len(points), 8, dtype=torch.int32), points.new_empty(len(points), 8)
     fill_corners(points.T.contiguous(), low, scale, last, offsets, rows, weights)
     return rows, weights
@@ -61,25 +61,25 @@ def _position(x, axis, low, scale, last):
 
 @inlined
 def _nearest(position):
-    """The vertex next to a position; one of the grid for NaN too, as loops do not look again."""
+    """Nearest vertex to a position; for NaN any of the grid, as loops do not check bounds."""
     return np.int64(np.rint(position)) if position > 0 else np.int64(0)
 
 
 @inlined
 def _below(position, highest):
-    """The vertex before a position; one of the grid for NaN too."""
+    """Vertex before a position; for NaN any of the grid."""
     return min(np.floor(position), highest) if position > 0 else np.float32(0)
 
 
 @inlined
 def _travelled(pace):
-    """As ``rays/contraction.travelled``."""
+    """Distance along a ray at a pace, as ``rays/contraction.travelled``."""
     return pace if pace <= np.float32(2) else np.float32(4) / (np.float32(4) - pace)
 
 
 @inlined
 def _drawn_in(x, y, z, contracted):
-    """What a point is multiplied by to be ``rays/contraction.contract`` of it."""
+    """Factor on a point that contracts it, as ``rays/contraction.contract``."""
     norm = math.sqrt(x * x + y * y + z * z) if contracted else np.float32(0)
     return (np.float32(2) - np.float32(1) / norm) / norm if norm > np.float32(1) else np.float32(1)
 
@@ -112,7 +112,7 @@ def occupied_blocks(occupancy, shape):
 
 @inlined
 def _left(position, vertex, pace):
-    """How many samples it takes to leave a block along one axis: no more than so, whatever was rounded."""
+    """Number of samples, not rounded, until a ray leaves a block along one axis; no more are skipped."""
     begin = np.float32(vertex // BLOCK_SIDE * BLOCK_SIDE) - np.float32(0.5)
     end = begin + np.float32(BLOCK_SIDE)
     if pace == 0:
@@ -161,7 +161,7 @@ def find_occupied(
 
 @compiled(f"void({_RAYS}, b1, i8[::1], i4[::1], i8[::1], i8[::1], f4[::1], i8[::1], f4[:,::1])")
 def fill_occupied(origins, directions, first, counts, step, contracted, begin, hits, starts, kept, t, ray, points):
-    """Write these samples, a ray's from ``starts`` on: distances ``[M]``, rays ``[M]``, points ``[3, M]``."""
+    """Write the occupied samples, each ray's from ``starts`` on: distances ``[M]``, rays ``[M]``, points ``[3, M]``."""
     for r in prange(len(counts)):
         for k in range(kept[r]):
             m, at = starts[r] + k, first[r] + np.float32(hits[begin[r] + k]) * step

@@ -1,4 +1,4 @@
-"""Gaussians of space to ellipses on a picture, with their colours, and the gradients' way back."""
+"""Loops that project 3D Gaussians to ellipses on a picture, with their colours, and the gradients back."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def _harmonics(basis, g, x, y, z, degrees):
 
 @fused_part
 def _rotation(quats, g):
-    """A quaternion's matrix, row by row, and one over its length."""
+    """Rotation matrix of Gaussian g's quaternion, row by row, and one over the quaternion's length."""
     w, x, y, z = quats[g, 0], quats[g, 1], quats[g, 2], quats[g, 3]
     over = ONE / math.sqrt(w * w + x * x + y * y + z * z)
     w, x, y, z = w * over, x * over, y * over, z * over
@@ -59,7 +59,7 @@ def _rotation(quats, g):
 
 @fused_part
 def _local(means, g, camera):
-    """A mean in the camera's frame, and x and y over z there as they are and as far as the lens is followed."""
+    """A Gaussian's mean in the camera's frame, its x / z and y / z there, and both cut to the lens' reach."""
     x, y, z = means[g, 0] - camera[9], means[g, 1] - camera[10], means[g, 2] - camera[11]
     a = camera[0] * x + camera[1] * y + camera[2] * z
     b = camera[3] * x + camera[4] * y + camera[5] * z
@@ -157,7 +157,7 @@ def project_back(
     means, scales, quats, opacities, sh0, shN, camera, degrees, flat, basis, colors, starts, slots, rows,
     d_means, d_scales, d_turns, d_opacities, d_base, d_rest, d_shift,
 ):  # fmt: skip
-    """Sum each Gaussian's rows of gradients up and take them back to its parameters."""
+    """Sum up each Gaussian's gradients over its tiles, and propagate them back to its parameters."""
     k = sh0.shape[1]
     for g in prange(len(means)):
         d_means[g, :], d_scales[g, :], d_turns[g, :], d_opacities[g, 0] = ZERO, ZERO, ZERO, ZERO

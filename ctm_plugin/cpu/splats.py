@@ -1,4 +1,4 @@
-"""Gaussians to a picture and back: which tiles each meets, compositing front to back, gradients of both."""
+"""Loops that rasterise Gaussians: lists of Gaussians by tile, compositing front to back, and gradients."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from ctm_plugin.cpu.splat_projection import (
 TILE_WIDTH, TILE_HEIGHT = 8, 32
 """Pixels of a tile across and down: a Gaussian's rows in a tile are composited whole."""
 TILE_PIXELS = TILE_WIDTH * TILE_HEIGHT
-"""Pixels of a tile."""
+"""Number of pixels in a tile."""
 MIN_ALPHA, MAX_ALPHA = np.float32(1 / 255), np.float32(0.99)
 """Least alpha that counts, and largest alpha (3DGS)."""
 SLACK = np.float32(1e-3)
@@ -52,12 +52,12 @@ E5, E4, E3, E2, E1, E0 = (np.float32(value) for value in np.polyfit(_nodes, np.e
 def picture(
     gaussians: tuple[Tensor, ...], camera: tuple, shift: Tensor, degrees: int, floor: float, more: int
 ) -> tuple[Tensor, Tensor]:
-    """Do as :func:`ctm_plugin.splats.render.picture`."""
+    """Render Gaussians without a background, see :func:`ctm_plugin.splats.render.picture`."""
     return Rasterization.apply(*gaussians, shift, camera, degrees, floor, more)
 
 
 class Rasterization(torch.autograd.Function):
-    """The picture ``[k + more, H, W]`` and what is left of the light ``[H, W]``."""
+    """Autograd function that renders a picture ``[k + more, H, W]`` and its transmittance ``[H, W]``."""
 
     @staticmethod
     def forward(ctx: Any, *arguments: Any) -> tuple[Tensor, Tensor]:
@@ -94,14 +94,14 @@ class Rasterization(torch.autograd.Function):
 
 
 def packed(camera: tuple, floor: float) -> Tensor:
-    """The camera's numbers in one table ``[27]``, the least that a colour may be among them."""
+    """The camera's numbers in one table ``[27]``, with ``floor``, the least value of a colour."""
     turn, centre, lens, distortion, reach, near, height, width = camera
     middle = torch.tensor([near, floor, width / 2, height / 2])
     return torch.cat([turn.flatten(), centre, lens, distortion, reach, middle]).contiguous()
 
 
 def binned(flat: Tensor, wide: int, high: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Lists of Gaussians by tile, each front to back.
+    """List the Gaussians that each tile meets, front to back.
 
     Returns:
         Of S pairs of a Gaussian and a tile: the Gaussian ``[S]``; where each Gaussian's pairs begin ``[N + 1]`` among
@@ -130,7 +130,7 @@ def _exp(p):
 
 @fused_part
 def _pixel(place):
-    """The first pixel whose centre does not lie before a place."""
+    """Index of the first pixel whose centre does not lie before a position."""
     return math.ceil(place - HALF)
 
 
@@ -153,7 +153,7 @@ def _span(flat, g, axis, low, high):
 
 @fused_part
 def _columns(flat, g, row, wide):
-    """The first tile, and the one after the last, whose pixels' centres a Gaussian reaches in a row of tiles."""
+    """First tile of a row of tiles, and the one after the last, whose pixel centres a Gaussian reaches."""
     top = np.float32(row * TILE_HEIGHT)
     least, most = _span(flat, g, 0, top + HALF, top + np.float32(TILE_HEIGHT) - HALF)
     first, last = max(_pixel(least - SLACK), 0), min(_pixel(most + SLACK - ONE) + 1, wide * TILE_WIDTH)
@@ -162,7 +162,7 @@ def _columns(flat, g, row, wide):
 
 @fused_part
 def _tile_rows(flat, g, high):
-    """The first row of tiles, and the one after the last, that a Gaussian reaches."""
+    """First row of tiles, and the one after the last, that a Gaussian reaches."""
     first = min(max(math.floor((flat[g, MEAN + 1] - flat[g, EXTENT + 1]) / np.float32(TILE_HEIGHT)), 0), high)
     last = min(max(math.floor((flat[g, MEAN + 1] + flat[g, EXTENT + 1]) / np.float32(TILE_HEIGHT)) + 1, 0), high)
     return first, last
@@ -188,7 +188,7 @@ def count_pairs(flat, wide, high, starts, tiles):
 
 @compiled("void(f4[:,::1], i8[::1], i8, i8, i8[::1], i8[::1], i4[::1], i4[::1])", parallel=False)
 def fill_pairs(flat, order, wide, high, starts, at, owner, slots):
-    """Write the lists, Gaussians in their order from front to back; ``at`` is where each tile's list goes on."""
+    """Write the tiles' lists of Gaussians, front to back; ``at`` is the next free slot of each tile's list."""
     for i in range(len(order)):
         g = order[i]
         j = starts[g]
@@ -206,7 +206,7 @@ def fill_pairs(flat, order, wide, high, starts, at, owner, slots):
 
 @fused_part
 def _rows(flat, g, left, top):
-    """The first of a tile's pixels, and the one after the last, of the rows that a Gaussian reaches there; unsigned."""
+    """First pixel of a tile, and the one after the last, in the rows that a Gaussian reaches there; unsigned."""
     low, high = _span(flat, g, 1, np.float32(left) + HALF, np.float32(left + TILE_WIDTH) - HALF)
     first = min(max(_pixel(low - SLACK) - top, 0), TILE_HEIGHT)
     last = min(max(_pixel(high + SLACK - ONE) + 1 - top, 0), TILE_HEIGHT)
@@ -215,7 +215,7 @@ def _rows(flat, g, left, top):
 
 @fused_part
 def _places(px, py, through, left, top, width, height):
-    """Centres of a tile's pixels, and all light before them; none outside the picture."""
+    """Write the centres of a tile's pixels, and their transmittance: 1, or 0 outside the picture."""
     for i in range(TILE_PIXELS):
         x, y = left + i % TILE_WIDTH, top + i // TILE_WIDTH
         px[i], py[i] = np.float32(x) + HALF, np.float32(y) + HALF
@@ -224,8 +224,8 @@ def _places(px, py, through, left, top, width, height):
 
 @fused_part
 def _lay(px, py, weight, through, first, last, mx, my, a, b, c, o):
-    """One Gaussian over some pixels. Numbers of pixels are unsigned, and products stand in place of choices: else LLVM
-    makes no vectors.
+    """Composite one Gaussian over a range of pixels. Indices of pixels are unsigned, and products stand in place of
+    branches: else LLVM makes no vectors.
     """
     for i in range(first, last):
         dx, dy = px[i] - mx, py[i] - my
@@ -245,7 +245,7 @@ def _add(row, weight, first, last, color):
     "void(i8[::1], i4[::1], f4[:,::1], f4[:,::1], i8, f4[:,:,::1], f4[:,::1], i8[::1])", fused=True,
 )  # fmt: skip
 def draw(tiles, owner, flat, colors, wide, image, left, ends):
-    """Composite each tile's list: ``image`` ``[C, H, W]``, ``left`` ``[H, W]``, ``ends`` where its list was left."""
+    """Composite each tile's list: picture ``[C, H, W]``, transmittance ``left`` ``[H, W]``; ``ends``: where it ends."""
     channels, height, width = image.shape
     for tile in prange(len(tiles) - 1):
         x0, y0 = (tile % wide) * TILE_WIDTH, (tile // wide) * TILE_HEIGHT
@@ -289,10 +289,10 @@ def _dot(weight, row, first, last):
 
 @fused_part
 def _lift(px, py, weight, value, through, behind, first, last, mx, my, a, b, c, o, sums):
-    """Lay a Gaussian again and sum what its mean, its conic and its opacity change.
+    """Composite a Gaussian again, and sum the gradients of its mean, its conic and its opacity.
 
-    ``behind`` is what all that lies behind a pixel is worth, by ``value`` what this one is: d alpha is
-    ``T v - behind / (1 - alpha)``.
+    ``value`` v is the loss gradient's product with the Gaussian's colour at a pixel, ``behind`` the same for all light
+    behind it: d alpha is ``T v - behind / (1 - alpha)``.
     """
     m0, m1, m2, m11, m12, m22 = ZERO, ZERO, ZERO, ZERO, ZERO, ZERO
     for i in range(first, last):
@@ -321,7 +321,7 @@ def _lift(px, py, weight, value, through, behind, first, last, mx, my, a, b, c, 
     " f4[:,::1])", fused=True,
 )  # fmt: skip
 def draw_back(tiles, owner, flat, colors, wide, image, left, ends, d_image, d_left, rows):
-    """Write a row of gradients for each pair: mean 2, conic 3, opacity, colours k; front to back once more."""
+    """Write gradients for each pair of Gaussian and tile, front to back: mean 2, conic 3, opacity, colours k."""
     channels, height, width = image.shape
     for tile in prange(len(tiles) - 1):
         x0, y0 = (tile % wide) * TILE_WIDTH, (tile // wide) * TILE_HEIGHT

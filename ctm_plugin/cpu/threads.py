@@ -1,4 +1,4 @@
-"""How many threads compute a training step, and what they do while they wait. Torch is not needed to say the latter."""
+"""Number of threads in a training step, and how OpenMP's threads wait, which can be set without importing torch."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ _loops: list[int] = []
 def let_waiting_threads_sleep() -> None:
     """Have OpenMP, once it is loaded, put threads to sleep that wait, unless the environment says how they wait.
 
-    By default they wait awake for milliseconds. Where another program has the core of the one that they wait for, they
-    take from it what they wait for: a step then takes ten times as long.
+    By default threads spin for milliseconds. Where another program shares the cores, spinning threads take the time of
+    the thread they wait for: a step then takes ten times as long.
     """
     if not any(name in os.environ for name in WAIT_VARIABLES):
         os.environ["GOMP_SPINCOUNT"] = str(MAX_SPINS)
 
 
 def warn_of_neighbours() -> None:
-    """Warn where threads wait awake and programs keep all cores busy: of a Python that had torch before us."""
+    """Warn where threads spin while programs keep all cores busy, as when torch was imported before this package."""
     import torch
 
     text = any(name in os.environ for name in WAIT_VARIABLES)
@@ -39,7 +39,7 @@ def warn_of_neighbours() -> None:
 
 @contextmanager
 def operators_on_one_thread(wanted: bool = True) -> Iterator[None]:
-    """Let torch's operators run on one thread within it, and loops on as many as torch had.
+    """Context in which torch's operators run on one thread, and loops on as many as torch had.
 
     Where loops do the work, operators between them are small: threads wait longer for each other than they compute.
     """
@@ -59,7 +59,7 @@ def operators_on_one_thread(wanted: bool = True) -> Iterator[None]:
 
 
 def loop_threads() -> int:
-    """Tell on how many threads loops run."""
+    """Number of threads on which compiled loops run."""
     import torch
 
     return _loops[-1] if _loops else torch.get_num_threads()

@@ -1,4 +1,4 @@
-"""Weights of packed samples, ray by ray: :func:`ctm_plugin.rays.volume.volume_weights`."""
+"""Loop of volume rendering weights of packed samples, ray by ray: :func:`ctm_plugin.rays.volume.volume_weights`."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from ctm_plugin.cpu.compiled import compiled
 
 
 class VolumeWeights(torch.autograd.Function):
-    """``w_i = T_i (1 - exp(-tau_i))``, ``T_i = exp(-sum_{j<i} tau_j)``, and the transmittance of a ray.
+    """Weights ``w_i = T_i (1 - exp(-tau_i))``, ``T_i = exp(-sum_{j<i} tau_j)``, and the transmittance of a ray.
 
     With ``g`` the gradient of w and ``h`` that of ``T_last``, that of ``tau_i`` is
     ``T_{i+1} g_i - sum_{j>i} w_j g_j - T_last h``. Sums are of float64.

@@ -1,4 +1,4 @@
-"""Contents of a folder of photographs by its files: cameras, pictures, and sources of near and far."""
+"""Contents of a data set's folder: photographs with their cameras, and sources of near and far."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ from ctm_plugin.data.readers.records import Record
 
 @dataclass(frozen=True)
 class Photograph:
-    """A picture and how it was taken.
+    """A photograph of a data set, with its camera and the files that belong to it.
 
     Attributes:
         path: the picture's file.
         name: as COLMAP's model or the data set's own file calls it.
         c2w: ``[3, 4]`` camera to world, OpenGL axes.
-        camera: what took it.
-        picture: that file; of a test view it need not be there.
-        mask: the picture of which pixels count, bright ones do; ``None``: all.
-        depth: the file of its depth, only for test views; all have one or none.
+        camera: intrinsics and lens of its camera.
+        picture: the opened file at ``path``; a test view may have none.
+        mask: file of a mask, whose bright pixels count; ``None``: all pixels count.
+        depth: file of the view's depth, only for test views; all have one or none.
         lit: the same view in normal light, only for test views.
-        shown: whether the camera is known to be of the picture as EXIF turns it.
+        shown: whether the camera is known to belong to the picture as EXIF turns it.
     """
 
     path: Path
@@ -45,21 +45,21 @@ class Photograph:
 
 @dataclass(frozen=True)
 class Capture:
-    """The photographs of a data set, and what its files say of near and far.
+    """The photographs of a data set, and the sources of its near and far bounds.
 
     Attributes:
         root: the data set's folder.
         source: the file with the cameras, for messages.
         photographs: in the order of the data set.
-        testing: ``[N]``, whether one is for testing.
+        testing: ``[N]``, whether a photograph is a test view.
         shrunk: whether the pictures have been shrunk by ``dataset.downscale`` already.
         depth_scale: scene units in one step of the depth.
         records: files that may hold ``near`` and ``far``.
-        rows: ``[N, 2]``, the depths between which each picture sees something, NaN where nobody tells.
-        clouds: find points, the best first.
-        lacking: the file whose points tell near and far, and what it lacks where they do not; ``None``: ``source``
-            should tell both, and a warning says whose points do.
-        synthetic: whether they are Synthetic-NeRF's kind, whose files leave out what the paper's codes know: a thing
+        rows: ``[N, 2]``, nearest and farthest depth in each picture, NaN where that is unknown.
+        clouds: functions that find clouds of points, the best cloud first.
+        lacking: the file whose points give near and far, and what it lacks if they do not; ``None``: ``source``
+            should give both, and a warning says which points do instead.
+        synthetic: whether the files are Synthetic-NeRF's, which leave out what the papers' codes know: an object
             with nothing behind it, near and far of all its scenes where they suit, views named within their split.
     """
 
@@ -81,7 +81,7 @@ class Capture:
 
     @property
     def views(self) -> tuple[str, ...]:
-        """A unique name for each view, see :func:`~ctm_plugin.data.readers.folders.view_names`."""
+        """A unique name for each photograph, see :func:`~ctm_plugin.data.readers.folders.view_names`."""
         splits = (~self.testing, self.testing) if self.synthetic else (np.ones_like(self.testing),)
         paths = [[self.photographs[i].path for i in np.flatnonzero(split)] for split in splits]
         return tuple(name for split in paths for name in view_names(split))

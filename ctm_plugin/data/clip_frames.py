@@ -29,8 +29,8 @@ class Course(NamedTuple):
     """Sharpness and movement of a clip's frames.
 
     Attributes:
-        moved: ``[N]`` how far the picture has moved until each frame, in its longer sides; never less than before.
-        sharpness: ``[N]`` energy of what is next to each other, to compare frames of the same things.
+        moved: ``[N]`` length that the picture has moved until each frame, in its longer sides; it never falls.
+        sharpness: ``[N]`` energy of the differences of neighbouring pixels, to compare frames of the same things.
     """
 
     moved: Float[np.ndarray, " n"]
@@ -38,7 +38,7 @@ class Course(NamedTuple):
 
 
 def course(frames: Iterable[Float32[np.ndarray, "h w"]]) -> Course:
-    """Watch grey frames ``[H, W]``, of which three are held at a time.
+    """Measure sharpness and movement of grey frames ``[H, W]``, of which three are held at a time.
 
     Movement is the median length of the optical flow from a base frame, a new one after each ``BASE_MOVEMENT``.
     """
@@ -63,9 +63,9 @@ def course(frames: Iterable[Float32[np.ndarray, "h w"]]) -> Course:
 
 
 def choose(courses: Sequence[Course]) -> list[list[int]]:
-    """Choose frames of clips: numbers from 0 for each clip, none of one that shows one place.
+    """Choose sharp frames of clips: numbers from 0 for each clip; none of a clip that does not move.
 
-    All windows are as long as one another in movement, ``MIN_FRAMES`` to ``MAX_FRAMES`` of all clips together.
+    Each is the sharpest of a window of equal movement; all clips together have ``MIN_FRAMES`` to ``MAX_FRAMES``.
     """
     lengths = [each.moved[-1] if len(each.moved) and each.moved[-1] >= MIN_MOVEMENT else 0.0 for each in courses]
     count = np.clip(round(sum(lengths) / FRAME_MOVEMENT), MIN_FRAMES, MAX_FRAMES)
@@ -76,7 +76,7 @@ def choose(courses: Sequence[Course]) -> list[list[int]]:
 
 
 def _sharpest(course: Course, count: int) -> list[int]:
-    """The sharpest frame of each of so many windows; none where that is blurred next to another window's."""
+    """The sharpest frame of each of ``count`` windows; none where it is blurred next to its neighbour's."""
     window = np.minimum(course.moved / course.moved[-1] * count, count - 1).astype(int)
     starts = np.flatnonzero(np.diff(window, prepend=-1))
     parts = np.split(course.sharpness, starts[1:])
@@ -90,7 +90,7 @@ def _sharpness(frame: Float32[np.ndarray, "h w"]) -> float:
 
 
 def _small(frame: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "i j"]:
-    """A frame averaged to ``FLOW_SIDE``, with a deviation of 1, so that the dark moves as the light does."""
+    """A frame averaged to ``FLOW_SIDE``, scaled to deviation 1, so that movement is found alike in dark and light."""
     factor = max(max(frame.shape) // FLOW_SIDE, 1)
     height, width = (side // factor for side in frame.shape)
     small = frame[: height * factor, : width * factor].reshape(height, factor, width, factor).mean((1, 3))

@@ -81,7 +81,7 @@ def find_model(root: Path) -> Path:
 
 
 def tell_of_others(folder: Path, known: int) -> None:
-    """Warn of pictures in that folder, or in ``input`` next to it (3DGS), that a model of so many leaves out."""
+    """Warn of pictures in ``folder``, or in ``input`` next to it (3DGS), that a model of ``known`` ones leaves out."""
     for each in (folder, folder.with_name("input")):
         count = sum(map(is_picture, each.rglob("*"))) if each.is_dir() else 0
         if count > known:

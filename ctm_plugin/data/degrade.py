@@ -13,9 +13,9 @@ from ctm_plugin.data.settings import NoiseConfig
 
 
 def add_noise(image: Tensor, noise: NoiseConfig, generator: torch.Generator) -> Tensor:
-    """Gaussian sensor noise in linear light, ``variance = shot x light + read²``, clipped to what a sensor can hold.
+    """Add Gaussian sensor noise in linear light, ``variance = shot x light + read²``, clipped to [0, 1].
 
-    ``[...]`` float sRGB in [0, 1], in and out; the generator is on its device.
+    ``image`` and the result are ``[...]`` float sRGB in [0, 1]; the generator is on their device.
     """
     if noise.off:
         return image

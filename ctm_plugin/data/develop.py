@@ -1,4 +1,4 @@
-"""From files to training images: read, shrink, degrade, round; many at a time."""
+"""Training images out of picture files: read, shrunk, dimmed, given noise, rounded; several at a time."""
 
 from __future__ import annotations
 
@@ -34,10 +34,9 @@ def memory() -> int:
 
 
 def means_matter(pictures: Sequence[PictureFile | None], config: PhotoConfig) -> bool:
-    """Whether pictures become smaller and are dark: a mean over many pixels tells more of their few levels than one of
-    256 does.
+    """Whether pictures are shrunk and dark: the means of their few dark levels then deserve more than 8 bits.
 
-    A few of them are looked at. Pictures that are dimmed, or get noise, are to be as a camera of 8 bits takes them.
+    A few pictures are sampled. Pictures that are dimmed, or get noise, stay at a camera's 8 bits.
     """
     there = [picture for picture in pictures if picture]
     if config.exposure != 1 or not config.noise.off:
@@ -109,7 +108,7 @@ def develop(
 
 
 def develop_depth(paths: Sequence[Path], scale: float, height: int, width: int) -> Float32[Tensor, "n h w"]:
-    """Distances along the ray ``[N, height, width]`` of one split, NaN for nothing; ``scale`` units a step."""
+    """Read one split's depth: distances along the ray ``[N, height, width]``, NaN for nothing, ``scale`` a step."""
     depths = []
     for path in paths:
         depth = read_depth(path, scale)
@@ -146,7 +145,7 @@ def develop_masks(
 
 
 def check_covers(path: Path, what: str, picture: Tensor, height: int, width: int) -> None:
-    """Refuse a picture ``[H, W]`` that is smaller than the images or has another ratio."""
+    """Refuse a mask or depth picture ``[H, W]`` that is smaller than the images or has another aspect ratio."""
     tall, wide = picture.shape
     if tall < height or wide < width or min(abs(tall * width / wide - height), abs(wide * height / tall - width)) > 1:
         raise DataError(path, f"{what} of {wide}x{tall} pixels", f"{width}x{height} as the images, or larger and alike")

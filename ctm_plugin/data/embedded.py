@@ -22,9 +22,9 @@ class Embedded(EmbeddedSettings):
     layout: ClassVar[type[FolderConfig]]
 
     def load(self) -> Scene:
-        """Read the scene, see its layout's ``load``; it is named with its light, ``still_life_dark``.
+        """Read the embedded scene by its layout's ``load``; its name has its light, ``still_life_dark``.
 
-        Its exposure is the light that it was rendered under times ``exposure``.
+        The scene's exposure is the light that it was rendered under times ``exposure``.
 
         Raises:
             DataError: the installed package is damaged.

@@ -27,7 +27,7 @@ def check_folder(root: Path, key: str, name: str | None) -> None:
 
 
 def as_captured(name: str, dark: str | None, lit: str | None) -> tuple[str | None, str | None]:
-    """Name a view's picture as it was captured, and its lit reference, by the name that the data set's file has.
+    """Name a view's picture as captured, and its lit reference, from the name in the data set's file.
 
     A picture has the same name in both folders. The first is ``None`` where only the lit reference is listed and
     there is no ``dark``, the second without ``lit``.
@@ -40,7 +40,7 @@ def as_captured(name: str, dark: str | None, lit: str | None) -> tuple[str | Non
 
 
 def warn_of_lit(capture: Capture, train: Views, test: Views) -> None:
-    """Say so where test pictures are far brighter than those that are trained on, and lie in another folder."""
+    """Warn if test pictures are far brighter than training pictures, and lie in another folder."""
     names = np.array([each.name for each in capture.photographs])
     homes = [{PurePosixPath(name).parent for name in names[split]} for split in (~capture.testing, capture.testing)]
     pictures = test.images if test.pictured is None else test.images[test.pictured]

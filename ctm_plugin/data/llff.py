@@ -42,7 +42,7 @@ class LLFFConfig(Layout, LLFFSettings):
         return self.posed(root, *self.developed(root))
 
     def developed(self, root: Path) -> tuple[list[PictureFile], bool]:
-        """The pictures, and whether they have been shrunk by ``downscale`` already."""
+        """The pictures of the folder, and whether they have been shrunk by ``downscale`` already."""
         folder, shrunk = find_pictures(root, self.whole_factor, self.factor)
         return [read_picture(path) for path in list_pictures(root, folder)], shrunk
 
@@ -84,7 +84,7 @@ class LLFFConfig(Layout, LLFFSettings):
 
 
 def which(root: Path) -> str:
-    """Say how to find the pictures that the poses of ``poses_bounds.npy`` are of; it does not name them."""
+    """Word the hint how to find the pictures of the poses in ``poses_bounds.npy``, which does not name them."""
     if (root / "view_imgs.txt").is_file():
         return ": leave only those there that view_imgs.txt names"
     if model := model_folder(root):
@@ -95,7 +95,7 @@ def which(root: Path) -> str:
 def read_poses(
     source: Path, bounded: bool
 ) -> tuple[Float64[np.ndarray, "n 3 4"], Float64[np.ndarray, "n 3"], Float64[np.ndarray, "n 2"] | None]:
-    """Camera to world with OpenGL axes, (height, width, focal length) in pixels, and the bounds if asked for.
+    """Read poses: camera to world, OpenGL axes; (height, width, focal length) in pixels; the bounds if ``bounded``.
 
     Bounds of pictures that see no points, zeros, NaN or infinity in the file, are NaN here; ``None`` where all are.
     """

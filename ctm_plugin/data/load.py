@@ -1,4 +1,4 @@
-"""From a folder to a scene: cameras and pictures, how they stand, what they show, near and far."""
+"""Loading of a data set's folder as a scene: cameras, pictures, geometry, near and far."""
 
 from __future__ import annotations
 
@@ -31,12 +31,12 @@ OPENCV_TO_OPENGL = np.array([1.0, -1.0, -1.0, 1.0])
 
 
 class Layout:
-    """Photographs in a folder of one layout, which says how its files are read; mixed into settings with bounds."""
+    """Mixin for a data set's settings: loads the scene of a folder whose layout's files ``capture`` reads."""
 
     layout: ClassVar[str]
 
     def capture(self) -> Capture:
-        """Read what the folder's files say, but no pixels.
+        """Read the cameras and the list of pictures out of the folder's files, without decoding pixels.
 
         Raises:
             DataError, ConfigError: see :meth:`load`.
@@ -44,7 +44,7 @@ class Layout:
         raise NotImplementedError
 
     def rig(self, capture: Capture | None = None) -> Rig:
-        """How the cameras stand, without the pictures; the ``capture`` is read unless it is given."""
+        """Arrangement of the data set's cameras, without the pixels; the ``capture`` is read unless it is given."""
         capture = capture or self.capture()
         first = next(each.picture.header for each in capture.photographs if each.picture)
         size = first[:2] if capture.shrunk else self.shrunk(first.height, first.width)
@@ -53,7 +53,7 @@ class Layout:
         return rig_of(cameras, list(capture.c2w), size, alone, nearest(capture, self))
 
     def load(self, capture: Capture | None = None) -> Scene:
-        """Read the data set; its ``capture`` is read unless it is given.
+        """Load the data set as a scene; its ``capture`` is read unless it is given.
 
         Returns:
             The scene, named as its folder, in units of the files' poses unless ``geometry`` is forward.
@@ -78,9 +78,9 @@ class Layout:
 def make_scene(
     root: Path, config: PhotoConfig, train: Views, test: Views, near: float, far: float, points: Points | None = None
 ) -> Scene:
-    """The scene of a folder, named as it, and settled; its exposure counts the light that it was rendered under.
+    """Make the scene of a folder, named like it, settled; its exposure includes the light that it was rendered under.
 
-    One warning tells of cameras that all look away from where their axes meet, as with another program's axes.
+    One warning tells if all cameras look away from where their axes meet, as with wrong axis conventions.
     """
     c2w = torch.cat([train.c2w, test.c2w]).double().numpy()
     if config.geometry != "forward" and meeting_depths(c2w * OPENCV_TO_OPENGL) is not None:
@@ -106,7 +106,7 @@ def make_scene(
 
 
 def settle(scene: Scene, root: Path) -> Scene:
-    """A ``forward`` scene as NDC needs it, NeRF's way; others as they are.
+    """Move and scale a ``forward`` scene as NDC needs it, NeRF's way; others stay as they are.
 
     The world is moved so that the mean camera stands at the origin and looks along -z, and scaled so that ``near`` lies
     at ``1 / 0.75``; the scene's near is then NDC's near plane, 1.

@@ -1,4 +1,4 @@
-"""Near and far along the rays: given, else out of points that cameras see, else out of where the cameras look."""
+"""Near and far along the rays: from settings or files, else from points that cameras see, else from the cameras."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ UNTOLD, SET = "no near and far there", "dataset.near and dataset.far set them"
 
 
 def near_far(capture: Capture, config: BoundsConfig, views: Sequence[Views]) -> tuple[float, float]:
-    """Choose near and far: the configuration's, else the first file's that has them, else those that are found."""
+    """Choose near and far: of the configuration, else of the first file that has them, else :func:`found_bounds`."""
     near, far = (given(capture, config, key) for key in ("near", "far"))
     if near is None or far is None:
         bounds = found_bounds(capture, config.geometry, views)
@@ -66,7 +66,7 @@ def given(capture: Capture, config: BoundsConfig, key: str) -> float | None:
 
 
 def nearest(capture: Capture, config: BoundsConfig) -> float | None:
-    """Find the nearest depth that files or their points tell, without any picture; ``None``: they do not."""
+    """Find the nearest depth by the data set's files or their points, without pixels; ``None``: they give none."""
     if (near := given(capture, config, "near")) is not None:
         return near
     if capture.rows is not None:
@@ -80,7 +80,7 @@ def nearest(capture: Capture, config: BoundsConfig) -> float | None:
 
 
 def found_bounds(capture: Capture, geometry: Geometry, views: Sequence[Views]) -> tuple[float, float]:
-    """Find near and far that nobody gives: from the file's rows, from points that pictures see, or from the cameras.
+    """Find near and far that are not given: from the file's rows, from points that pictures see, or from the cameras.
 
     A warning tells of guesses, and of points that belong to other files.
     """
@@ -103,7 +103,7 @@ def found_bounds(capture: Capture, geometry: Geometry, views: Sequence[Views]) -
 
 
 def ray_bounds(nearest: float, farthest: float, geometry: Geometry, views: Views) -> tuple[float, float]:
-    """Bounds along the rays, the longest of the views', out of bounds of the depth along the cameras' axes.
+    """Turn bounds of depth along the cameras' axes into bounds of distance along the rays, for the views' widest ray.
 
     ``forward`` keeps the nearest as it is: :func:`~ctm_plugin.data.load.settle` has its own margin.
     """
@@ -111,7 +111,7 @@ def ray_bounds(nearest: float, farthest: float, geometry: Geometry, views: Views
 
 
 def depth_bounds(depths: Sequence[Float64[np.ndarray, " _"]]) -> tuple[float, float] | None:
-    """Find the nearest and farthest of the depths of points, one list a camera; ``None`` where no camera sees any.
+    """Find the nearest and farthest depth of points, given one array a camera; ``None`` where no camera sees any.
 
     Percentiles over all cameras' points, widened to those of each camera that sees enough of them.
     """
@@ -125,7 +125,7 @@ def depth_bounds(depths: Sequence[Float64[np.ndarray, " _"]]) -> tuple[float, fl
 
 
 def depths_seen(cloud: Cloud) -> list[Float64[np.ndarray, " _"]]:
-    """Compute the depths, in units of the data set's poses, for each picture of COLMAP's, of the points that it sees.
+    """Compute the depths of the points that each of COLMAP's pictures sees, in units of the data set's poses.
 
     Points that fewer than ``MIN_TRACK`` of the pictures see count only where there are no others.
     """
@@ -139,7 +139,7 @@ def depths_seen(cloud: Cloud) -> list[Float64[np.ndarray, " _"]]:
 
 
 def bounds_of(cloud: Cloud, views: Sequence[Views]) -> tuple[float, float] | None:
-    """Find the nearest and farthest depths of the points that pictures see, or that views show where nobody tells."""
+    """Find the nearest and farthest depth of a cloud's points in the pictures, by its tracks, else by projection."""
     if (bounds := depth_bounds(depths_seen(cloud))) is not None:
         return bounds
     positions = torch.from_numpy(cloud.world.moved(cloud.positions))
@@ -164,7 +164,7 @@ def camera_bounds(c2w: Float64[np.ndarray, "n 3 4"], geometry: Geometry) -> tupl
 def bounds_of_cameras(
     capture: Capture, geometry: Geometry, source: Path, missing: str, remarks: str = ""
 ) -> tuple[float, float]:
-    """Guess near and far from only the cameras, with one warning of what ``source`` lacks and why others are no use."""
+    """Guess near and far from only the cameras, with one warning: what ``source`` lacks, why other sources fail."""
     if (bounds := camera_bounds(capture.c2w, geometry)) is None:
         raise DataError(source, f"{missing}, all cameras at one place", "some, or dataset.near and dataset.far")
     warning = "{:.3g} and {:.3g} are taken from where the cameras stand and look".format(*bounds)
@@ -173,7 +173,7 @@ def bounds_of_cameras(
 
 
 def usual_bounds(capture: Capture, geometry: Geometry) -> tuple[float, float]:
-    """Synthetic-NeRF's near and far where they suit the cameras, else such as do; a warning tells of doubts.
+    """Synthetic-NeRF's near and far where they suit the cameras, else the cameras'; a warning tells of doubts.
 
     They suit where a ball of ``OBJECT_RADIUS`` round the point where the axes meet lies between them in all cameras.
     """
@@ -189,9 +189,9 @@ def usual_bounds(capture: Capture, geometry: Geometry) -> tuple[float, float]:
 
 
 def joint_bounds(capture: Capture, geometry: Geometry) -> tuple[float, float]:
-    """Nearest and farthest depth of all rows; one warning tells of rows that are left out.
+    """Nearest and farthest depth of all rows of the capture; one warning tells of rows that are left out.
 
-    Rows of NaN are of pictures that see no points. A far above ``OUTLIER_FAR`` medians comes from a few bad points
+    Rows of NaN belong to pictures that see no points. A far above ``OUTLIER_FAR`` medians comes from a few bad points
     and would spoil a box; NDC has room for it.
     """
     bounds = capture.rows
@@ -206,5 +206,5 @@ def joint_bounds(capture: Capture, geometry: Geometry) -> tuple[float, float]:
 
 
 def is_bound(value: Number) -> bool:
-    """Whether a distance can be near or far."""
+    """Whether a number can be a near or far bound, from 0 to ``MAX_COORDINATE``."""
     return 0 <= value <= MAX_COORDINATE

@@ -1,4 +1,4 @@
-"""Finding a data set's pictures, their masks, and what its files list."""
+"""Finding a data set's pictures, by folder or by the names in its files, and their masks."""
 
 from __future__ import annotations
 
@@ -41,9 +41,9 @@ def list_pictures(root: Path, folder: Path) -> list[Path]:
 
 
 def find_pictures(root: Path, whole_factor: int, factor: int | None = None) -> tuple[Path, bool]:
-    """The folder ``images_<whole_factor>`` where it is there, else ``images``; with ``factor`` ``images_<factor>``.
+    """Find the pictures' folder: ``images_<whole_factor>``, else ``images``; with ``factor`` ``images_<factor>``.
 
-    And whether its pictures have been shrunk by ``dataset.downscale`` already.
+    The second result is whether its pictures have been shrunk by ``dataset.downscale`` already.
     """
     if factor is None and has_shrunk(root, whole_factor):
         return root / f"images_{whole_factor}", True
@@ -59,7 +59,7 @@ def find_pictures(root: Path, whole_factor: int, factor: int | None = None) -> t
 
 
 def has_shrunk(root: Path, whole_factor: int) -> bool:
-    """Whether ``images_<whole_factor>`` holds the pictures; not with fewer than ``images``, which a warning tells."""
+    """Whether ``images_<whole_factor>`` holds all pictures; if it holds fewer than ``images``, a warning says so."""
     ready, whole = root / f"images_{whole_factor}", root / "images"
     if whole_factor == 1 or not ready.is_dir():
         return False
@@ -70,7 +70,7 @@ def has_shrunk(root: Path, whole_factor: int) -> bool:
 
 
 def masks_beside(root: Path, names: Sequence[PurePath]) -> list[Path | None]:
-    """Masks of pictures: ``masks/NAME.EXT.png``, COLMAP's, ``NAME.png`` or ``NAME_mask.png``, in any case, of any kind.
+    """Find masks: ``masks/NAME.EXT.png``, COLMAP's, ``NAME.png`` or ``NAME_mask.png``, in any case, of any kind.
 
     Names are those in the pictures' own folder; pictures without a mask count whole, with one warning.
     """
@@ -102,7 +102,7 @@ def masks_beside(root: Path, names: Sequence[PurePath]) -> list[Path | None]:
 def find_listed(root: Path, name: str, source: Path) -> Path | None:
     """The picture that ``source`` calls ``name``, also with another suffix; ``None`` where there is none.
 
-    One of a kind that is read here goes before one of another, such as ``a.jpg`` before ``a.BMP``.
+    Files in formats that are read here go before others: ``a.jpg`` before ``a.BMP``.
     """
     path = PurePosixPath(plain_name(name))
     file = look_for(root, name, source)
@@ -115,7 +115,7 @@ def find_listed(root: Path, name: str, source: Path) -> Path | None:
 
 
 def existing(root: Path, paths: Sequence[Path | None], names: Sequence[str], source: Path) -> list[int]:
-    """Numbers of the pictures that are there, which ``source`` calls by these names; one warning counts the others."""
+    """Indices of the listed pictures whose files exist; one warning counts the others by their names in ``source``."""
     missing = [name for path, name in zip(paths, names, strict=True) if path is None]
     left = len(names) - len(missing)
     if left < MIN_PHOTOGRAPHS:
@@ -137,5 +137,5 @@ def existing(root: Path, paths: Sequence[Path | None], names: Sequence[str], sou
 
 
 def every(step: int, count: int) -> np.ndarray:
-    """``[count]`` booleans, true for each number divisible by ``step``."""
+    """Booleans ``[count]``, true at each index divisible by ``step``."""
     return np.arange(count) % step == 0

@@ -53,7 +53,7 @@ class PlanarConfig(PlanarSettings):
 
 
 def photograph(image: str | Path) -> Path:
-    """The file of a photograph: one of scikit-image's by name, else the path itself."""
+    """Find a photograph's file: one of scikit-image's by name, else the path itself."""
     if str(image) in PHOTOGRAPHS:
         return Path(str(files("skimage.data").joinpath(PHOTOGRAPHS[str(image)])))
     path = Path(image)
@@ -66,7 +66,7 @@ def photograph(image: str | Path) -> Path:
 
 
 def _read(path: Path, config: PlanarConfig) -> Float[Tensor, "h w 3"]:
-    """The picture in colour; one warning names what had to be converted."""
+    """Read a picture in colour; one warning names the conversions."""
     picture = read_picture(path)
     height, width, alpha, deep, *_ = picture.header
     if min(height, width) < config.patch:
@@ -84,7 +84,7 @@ def _read(path: Path, config: PlanarConfig) -> Float[Tensor, "h w 3"]:
 
 
 def fitted(image: Float[Tensor, "h w 3"], height: int, width: int) -> Float[Tensor, "h2 w2 3"]:
-    """The picture scaled, its ratio kept, until it covers ``height`` x ``width``, and cut equally at both edges."""
+    """Scale a picture, ratio kept, until it covers ``height`` x ``width``, and crop it equally at both edges."""
     if image.shape[:2] == (height, width):
         return image
     scale = max(height / image.shape[0], width / image.shape[1])
@@ -95,7 +95,7 @@ def fitted(image: Float[Tensor, "h w 3"], height: int, width: int) -> Float[Tens
 
 
 def draw_warps(config: PlanarConfig) -> Float[Tensor, "5 8"]:
-    """Random homographies under which all corners of a patch lie inside the picture; the first is the identity.
+    """Draw random homographies under which all corners of a patch lie inside the picture; the first is the identity.
 
     ``h ~ N(0, noise_h^2)``, (h1, h2) moved by ``noise_t`` towards a corner, drawn again until it fits.
 
@@ -118,7 +118,7 @@ def draw_warps(config: PlanarConfig) -> Float[Tensor, "5 8"]:
 
 
 def cut(image: Float[Tensor, "h w 3"], warps: Float[Tensor, "n 8"], patch: int) -> Float[Tensor, "n p p 3"]:
-    """Patches of a picture under homographies, with bilinear interpolation, 0 outside the picture."""
+    """Cut patches out of a picture under homographies, with bilinear interpolation, 0 outside the picture."""
     height, width, _ = image.shape
     grid = warp(pixel_grid(height, width, patch).flatten(0, 1), sl3_exp(warps)).unflatten(1, (patch, patch))
     grid = grid * max(height, width) / grid.new_tensor([width, height])

@@ -1,4 +1,4 @@
-"""The 3D points that reconstructions have, and which pictures see them: COLMAP's, and those of a PLY file."""
+"""3D points of reconstructions, and the pictures that see them: of COLMAP's models and of PLY files."""
 
 from __future__ import annotations
 
@@ -32,14 +32,14 @@ Poses = Sequence[tuple[str, Float64[np.ndarray, "3 4"]]]
 
 
 class Cloud(NamedTuple):
-    """Points in a world of their own.
+    """A reconstruction's 3D points, in its own world.
 
     Attributes:
-        name: where they are from, for messages.
+        name: where the points are from, for messages.
         positions: ``[P, 3]``.
-        world: how that world lies in the one of the data set's poses.
-        taken: pictures; none where nobody tells which see the points.
-        tracks: for each of them the rows of the points that it sees, each once.
+        world: similarity from the points' world to that of the data set's poses.
+        taken: pictures of the reconstruction; empty where it is unknown which see the points.
+        tracks: for each picture the rows of the points that it sees, each once.
     """
 
     name: str
@@ -62,7 +62,7 @@ def read_cloud(name: str, taken: Sequence[Taken], path: Path, world: Similarity 
 
 
 def model_beside(root: Path, poses: Poses) -> PointsOrReason:
-    """Find the points of COLMAP's model next to other files, where its cameras are theirs up to a similarity."""
+    """Find the points of a COLMAP model next to other files, if its cameras equal the files' up to a similarity."""
     folder = model_folder(root)
     if folder is None:
         return None, ""
@@ -122,7 +122,7 @@ def points_of(cloud: Cloud, names: Sequence[str]) -> Points | None:
 
 
 def first_points(names: Sequence[str], *reads: Callable[[], PointsOrReason]) -> Points | None:
-    """Take the first points that are there and can be read, see :func:`points_of`; ``None`` where there are none."""
+    """Take the first cloud that exists and can be read, see :func:`points_of`; ``None`` where there is none."""
     for read in reads:
         with suppress(DataError):  # no scene needs points: what does has read them before
             cloud, _ = read()

@@ -58,8 +58,8 @@ def relative_brightness(records: list[Path], raws: list[Path]) -> list[float]:
     """Factors that give pictures of different exposures the colours of the longest one: ``max(e) / e``.
 
     ``e`` is the shutter time x ISO, by each picture's EXIF data as JSON, or without these files what each picture says
-    itself. A field has one colour for each point, whatever the shutter did. The longest is the measure, as in RawNeRF:
-    what it clips is clipped in all. Where a picture does not tell, all stay as they were shot.
+    itself. A field has one colour for each point, whatever the shutter did. The longest is the reference, as in
+    RawNeRF: what it clips is clipped in all. Where a picture has no exposure, all factors are 1.
     """
     missing = [record for record in records if not record.exists()]
     if missing and len(missing) < len(records):

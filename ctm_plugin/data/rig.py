@@ -1,4 +1,4 @@
-"""Arrangement of a capture's cameras, read without its pictures: it decides the geometry and a film's path."""
+"""Arrangement of a capture's cameras, which decides the geometry and a film's path; no pixels are read."""
 
 from __future__ import annotations
 
@@ -31,9 +31,9 @@ class Rig:
     Attributes:
         c2w: ``[N, 3, 4]`` camera to world, OpenGL axes.
         corner: the largest angle between a camera's axis and a ray of its picture, in radians.
-        size: height and width of a picture as training has it.
-        alone: whether there is only a thing and nothing behind it, as where pictures have alpha.
-        near: depth of what is nearest, as files or their points say; ``None``: they do not.
+        size: height and width of a training picture.
+        alone: whether there is an object with nothing behind it, as where pictures have alpha.
+        near: nearest depth by the files or their points; ``None``: unknown.
     """
 
     c2w: Float64[np.ndarray, "n 3 4"]
@@ -52,7 +52,7 @@ class Rig:
 
     @property
     def looks_one_way(self) -> bool:
-        """Whether all rays go the same way from cameras that stand in a layer: what NDC is for."""
+        """Whether NDC suits: all rays go the same way, from cameras at nearly the same depth."""
         if self.angle + self.corner >= MAX_NDC_ANGLE:
             return False
         mean = -self.c2w[:, :, 2].sum(0)
@@ -65,7 +65,7 @@ class Rig:
         return bool(along.max() - along.mean() <= MAX_ADVANCE * near)
 
     def geometry(self, among: Sequence[str] = GEOMETRIES) -> tuple[Geometry, str]:
-        """Choose the geometry, of those that a backbone has, and say why."""
+        """Choose the geometry, ``among`` those that a backbone has, and give the reason in words."""
         if self.looks_one_way and not self.alone:
             return "forward", f"all {len(self.c2w)} cameras look one way, within {math.degrees(self.angle):.0f} degrees"
         around = turn(self.c2w)
@@ -80,7 +80,7 @@ def rig_of(
     alone: bool,
     near: float | None = None,
 ) -> Rig:
-    """The rig of these cameras, without what their lenses distort."""
+    """Make the rig of these cameras, lens distortion ignored."""
     corner = max(
         math.hypot(max(each.cx, each.width - each.cx) / each.fx, max(each.cy, each.height - each.cy) / each.fy)
         for each in cameras

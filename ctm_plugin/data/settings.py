@@ -88,11 +88,11 @@ class PhotoConfig(DimConfig):
 
     @property
     def whole_factor(self) -> int:
-        """The factor of a folder ``images_<factor>`` that may hold the pictures already shrunk; 1: none may."""
+        """The factor of a folder ``images_<factor>`` that may hold the pictures already shrunk; 1: no such folder."""
         return int(self.downscale) if self.width is None and self.downscale == int(self.downscale) else 1
 
     def trained_on(self, testing: Bool[np.ndarray, " n"]) -> Int64[np.ndarray, " t"]:
-        """Numbers of the pictures that become training views, in order: not for ``testing``, thinned by ``skip``."""
+        """Indices of the pictures that become training views, in order: not for ``testing``, thinned by ``skip``."""
         return np.flatnonzero(~testing)[:: self.skip]
 
     def shrunk(self, height: int, width: int) -> tuple[int, int]:
@@ -182,7 +182,7 @@ class CaptureConfig(BoundsConfig):
 
     @property
     def whole_factor(self) -> int:
-        """As others', but pixels that were cut off count in the pictures as they were taken."""
+        """The base class's factor, but 1 with ``crop``, whose pixels are counted in the pictures as they were taken."""
         return 1 if self.crop else super().whole_factor
 
 

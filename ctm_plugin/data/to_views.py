@@ -1,4 +1,4 @@
-"""Photographs made into views: which way up, how large, what they show and where their cameras stand."""
+"""Views out of photographs: orientation, size, pixels and cameras."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from ctm_plugin.scene.views import Views
 
 
 def develop_photographs(capture: Capture, config: BoundsConfig) -> tuple[Views, Views]:
-    """Training views, thinned by ``config.skip``, and test views."""
+    """Develop a capture's photographs into training views, thinned by ``config.skip``, and test views."""
     source, photographs = capture.source, upright(capture.photographs, capture.source)
     headers = headers_of(photographs)
     photo = replace(config, downscale=1) if capture.shrunk else config
@@ -90,7 +90,7 @@ def upright(photographs: Sequence[Photograph], source: Path) -> list[Photograph]
 
 
 def headers_of(photographs: Sequence[Photograph]) -> list[Header]:
-    """Each picture's header; of one that is not there, the size of that whose sides are most like its camera's."""
+    """Each photograph's header; a missing picture gets the size of the one with the shape nearest to its camera's."""
     known = [each.picture.header for each in photographs if each.picture]
 
     def like(camera: Intrinsics) -> Header:
@@ -134,9 +134,9 @@ def camera_of(photograph: Photograph, header: Header, source: Path, crop: tuple[
 
 
 def exposures_told(headers: Sequence[Header]) -> Float32[Tensor, " n"] | None:
-    """The light ``[N]`` that pictures took by their EXIF; NaN where it does not tell, ``None`` where none does.
+    """The pictures' exposures ``[N]`` by their EXIF; NaN where EXIF does not give one, ``None`` where none does.
 
-    Of several cameras, whose own factors differ, it is relative to the median of each one's pictures.
+    Those of several cameras, whose own factors differ, are relative to the median of each camera's.
     """
     exposures = torch.tensor([math.nan if header.exposure is None else header.exposure for header in headers])
     cameras = [header.lens[:2] for header in headers]
@@ -149,7 +149,7 @@ def exposures_told(headers: Sequence[Header]) -> Float32[Tensor, " n"] | None:
 def develop_lit(
     photographs: Sequence[Photograph], config: PhotoConfig, sizes: Sequence[tuple[int, int]], canvas: tuple[int, int]
 ) -> UInt8[Tensor, "n h w 3"] | None:
-    """Develop the lit references of test views, shrunk as their pictures and else as they are; ``None`` without any."""
+    """Develop the lit references of test views, shrunk like their pictures, not dimmed; ``None`` without any."""
     pictures = [photograph.lit for photograph in photographs if photograph.lit is not None]
     if not pictures:
         return None

@@ -59,14 +59,14 @@ class TransformsConfig(Layout, TransformsSettings):
 
 
 class Listed(NamedTuple):
-    """A frame and its files.
+    """A frame listed in a ``transforms.json``, with its picture files.
 
     Attributes:
-        record, frame: the file and its entry there.
-        name: of the picture as captured; ``None``: nobody names it.
-        path: of that picture; ``None``: it is not there.
-        lit: the name of its lit reference, with ``dataset.lit``.
-        testing: whether it is for testing; ``None``: no file says so.
+        record, frame: the JSON file and the frame's entry in it.
+        name: name of the picture as captured; ``None``: the files do not name it.
+        path: path of the picture as captured; ``None``: it does not exist.
+        lit: name of the view's lit reference, with ``dataset.lit``.
+        testing: whether the frame is for testing; ``None``: no file says.
     """
 
     record: Record
@@ -78,7 +78,7 @@ class Listed(NamedTuple):
 
 
 def read_files(root: Path) -> list[tuple[Record, bool | None]]:
-    """Read the files, and whether their frames are for testing; ``None`` where that is yet to be found.
+    """Read a folder's JSON files, and whether their frames are for testing; ``None`` where the files leave that open.
 
     ``transforms_train.json`` with ``transforms_test.json``, else with ``transforms_val.json``; without such a pair
     ``transforms.json``, else the one that is there.
@@ -101,10 +101,10 @@ def capture_of(
     whole_factor: int = 1,
     synthetic: bool = False,
 ) -> Capture:
-    """The photographs of these files, each with whether its frames are for testing.
+    """Make the capture of these JSON files, each given with whether its frames are for testing.
 
-    Those of Synthetic-NeRF's kind, ``synthetic``, are in the files' order, with depth; for the rest see
-    :class:`TransformsConfig`.
+    ``synthetic``: files of Synthetic-NeRF's kind, whose views stay in the files' order, with depth. For the other
+    arguments see :class:`TransformsConfig`.
     """
     records = [record for record, _ in files]
     source, frames = records[0].source, [frame for record in records for frame in frames_of(record)]
@@ -190,7 +190,7 @@ def list_frames(
 
 
 def name_list(record: Record, *keys: str) -> set[str]:
-    """Read the names under the first of these keys that is there and not empty."""
+    """Read the set of names under the first of these keys that has any."""
     key = next((key for key in keys if record.values.get(key)), None)
     names = record.texts(key, "a list of the frames' file_path") if key else ()
     return {plain_name(name, record.source.parent) for name in names}
@@ -202,12 +202,12 @@ def frame_name(frame: Record) -> str:
 
 
 def inner(path: Path) -> Path:
-    """Take off the folder of pictures, where there is one."""
+    """Drop a path's first folder, that of the pictures, if it has one."""
     return Path(*path.parts[1:]) if len(path.parts) > 1 else path
 
 
 def resized(root: Path, name: str, factor: int) -> str:
-    """``images_4/a.png`` for ``images/a.png`` and 4 where there is such a folder, masks alike; others unchanged."""
+    """Rename ``images/a.png`` to ``images_4/a.png`` for factor 4 if that folder exists, masks alike; else unchanged."""
     first, *rest = PurePosixPath(name).parts or (name,)
     folder = f"{first}_{factor}"
     there = first in ("images", "masks") and rest and factor > 1 and (root / folder).is_dir()
@@ -245,7 +245,7 @@ def split(listed: list[Listed], source: Path, test_every: int) -> tuple[list[Lis
 
 
 def photograph(root: Path, each: Listed, camera: Intrinsics, picture: PictureFile | None, factor: int) -> Photograph:
-    """The photograph of a frame, with the mask of the shrunk ones where ``factor`` says that there are such."""
+    """Make the photograph of a frame, with its mask, out of ``masks_<factor>`` where there is such a folder."""
     source, mask, lit = each.record.source, None, None
     if each.frame.values.get("mask_path"):
         name = plain_name(each.frame.text("mask_path", "the path of a picture"), root)

@@ -1,4 +1,4 @@
-"""Writing COLMAP's binary model, what :mod:`ctm_plugin.data.readers.colmap_model` reads, with only numpy and scipy."""
+"""Writing of COLMAP's binary models, which :mod:`ctm_plugin.data.readers.colmap_model` reads, with numpy and scipy."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def write_model(
     COLMAP counts from 1: camera ``cameras[c - 1]``, picture ``taken[i - 1]``, point ``positions[p - 1]``.
 
     Args:
-        folder: of the model; it is made.
+        folder: the model's folder, which is created.
         cameras: ``PINHOLE``, ``OPENCV`` where they distort, ``FULL_OPENCV`` where k3 is not 0.
         taken: the pictures; ``camera`` and ``points`` are COLMAP's numbers.
         places: where each picture sees its points, in pixels.

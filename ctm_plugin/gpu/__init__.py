@@ -1,1 +1,1 @@
-"""Triton kernels that make a GPU fast; :mod:`ctm_plugin.door` is where functions of other rooms meet them."""
+"""Triton kernels in place of torch functions on a GPU; :mod:`ctm_plugin.door` decides which of the two runs."""

@@ -1,4 +1,4 @@
-"""Adam of the rows of a table that have a gradient, in one pass: :func:`ctm_plugin.optim.grid_adam.step_table`."""
+"""Kernel of Adam for the rows of a table that have a gradient: :func:`ctm_plugin.optim.grid_adam.step_table`."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def step_table(
     table: Tensor, grad: Tensor, exp_avg: Tensor, exp_avg_sq: Tensor, rates: Tensor | None, step: int,
     lr: float, betas: tuple[float, float], eps: float,
 ) -> None:  # fmt: skip
-    """Do as :func:`ctm_plugin.optim.grid_adam.step_table`; moments of rows without gradient are not even read.
+    """Step a table by Adam in place (:func:`ctm_plugin.optim.grid_adam.step_table`); rows without gradient are skipped.
 
     Raises:
         ValueError: a table is not contiguous.

@@ -1,4 +1,4 @@
-"""Features out of a hash grid, and their gradient, a program a block of points and a level:
+"""Kernels of hash-grid lookups and their gradient, one program for each block of points and level:
 :mod:`ctm_plugin.rays.hash_grid`."""
 
 from __future__ import annotations
@@ -14,19 +14,19 @@ from ctm_plugin.gpu.lookup import cell, place
 POINT_BLOCK = 128
 """Points that one program of the kernel looks up."""
 PRIME_Y: tl.constexpr = tl.constexpr(2654435761)
-"""Primes that the second and third coordinate of a vertex are multiplied by."""
+"""Primes of the spatial hash, for the second and third coordinate of a vertex."""
 PRIME_Z: tl.constexpr = tl.constexpr(805459861)
 
 
 def encoded(table: Tensor, points: Tensor, sides: Tensor, starts: Tensor) -> Tensor:
-    """Do as :func:`ctm_plugin.rays.hash_grid.encoded`."""
+    """Look up hash-grid features of points, see :func:`ctm_plugin.rays.hash_grid.encoded`."""
     features = points.new_empty(len(points), len(sides) * table.shape[1])
     _go_over(table.detach().contiguous(), points, sides, starts, features, back=False)
     return features
 
 
 def spread(grad: Tensor, points: Tensor, sides: Tensor, starts: Tensor, shape: torch.Size) -> Tensor:
-    """Do as :func:`ctm_plugin.rays.hash_grid.spread`, in any order."""
+    """Add up the gradient of hash-grid features, see :func:`ctm_plugin.rays.hash_grid.spread`, in any order."""
     table_grad = grad.new_zeros(shape)
     _go_over(table_grad, points, sides, starts, grad.contiguous(), back=True)
     return table_grad
@@ -50,7 +50,7 @@ def _look_up(
     table, points, along, across, sides, starts, numbers, count,
     BACK: tl.constexpr, LEVELS: tl.constexpr, FEATURES: tl.constexpr, WIDTH: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Write the numbers ``[M, L F]`` that the table has at points; ``BACK``: add them to it."""
+    """Write the table's features ``[M, L F]`` at points; ``BACK``: add the gradient ``numbers`` to the table."""
     m, feature = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK), tl.arange(0, WIDTH)
     there, level = m < count, tl.program_id(1)
     both = there[:, None] & (feature < FEATURES)[None, :]

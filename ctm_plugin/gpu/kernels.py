@@ -1,4 +1,4 @@
-"""Making and launching of kernels."""
+"""Compilation and launch of Triton kernels."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ are 1."""
 
 
 def kernel(function: Callable) -> Any:
-    """Make a function a Triton kernel, or a part of one, compiled when it is first launched."""
+    """Decorate a function as a Triton kernel, or a part of one, compiled at its first launch."""
     raw = inspect.unwrap(function)  # type checkers of tests wrap functions
     return triton.jit(raw, do_not_specialize=[name for name in inspect.signature(raw).parameters if name in VARYING])
 
 
 def launch(of: Any, programs: tuple[int, ...], *arguments: Any, **options: Any) -> None:
-    """Run so many programs of a kernel, on the device of its first argument; none of none.
+    """Launch a kernel with a grid of ``programs``, on the device of its first argument; do nothing for an empty grid.
 
-    Every product and every sum is rounded, so that two kernels find the same number by the same formula.
+    Products and sums are not fused, so that two kernels find the same number by the same formula.
 
     Args:
         of: the kernel.
-        programs: along each axis.
+        programs: number of programs along each axis of the grid.
         arguments: tensors, which are contiguous where the kernel does not ask for strides, and numbers.
         options: the kernel's constants, and Triton's options.
     """
@@ -38,5 +38,5 @@ def launch(of: Any, programs: tuple[int, ...], *arguments: Any, **options: Any) 
 
 
 def whole(*tensors: Tensor) -> tuple[Tensor, ...]:
-    """Make tensors contiguous."""
+    """Give contiguous versions of tensors."""
     return tuple(each.contiguous() for each in tensors)

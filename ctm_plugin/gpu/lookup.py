@@ -1,4 +1,4 @@
-"""Trilinear lookups and their gradient: :mod:`ctm_plugin.rays.grid`."""
+"""Kernels of trilinear grid lookups and their gradient: :mod:`ctm_plugin.rays.grid`."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from ctm_plugin.gpu.kernels import kernel, launch, whole
 POINTS = 128
 """Points that one program of the kernel handles."""
 ELEMENT_BLOCK = 512
-"""Features, of all its points, that one program of a lookup holds at once."""
+"""Number of features, over all its points, that one program of a lookup holds at once."""
 
 
 def corners(points: Tensor, low: Tensor, scale: Tensor, last: Tensor, offsets: Tensor) -> tuple[Tensor, Tensor]:
-    """Do as :func:`ctm_plugin.rays.grid.corners`."""
+    """Find rows and weights ``[M, 8]`` of the vertices round points, see :func:`ctm_plugin.rays.grid.corners`."""
     count = len(points)
     rows, weights = points.new_empty(count, 8, dtype=torch.int32), points.new_empty(count, 8)
     box = whole(low, scale, last, offsets)
@@ -26,14 +26,14 @@ def corners(points: Tensor, low: Tensor, scale: Tensor, last: Tensor, offsets: T
 
 @kernel
 def place(x, low, scale, last):
-    """Find the position in voxels, within the grid; NaN stays NaN."""
+    """Turn a coordinate into a position in voxels, clamped to the grid; NaN stays NaN."""
     at = (x - low) * scale
     return tl.where(at > 0, tl.minimum(at, last), tl.where(at == at, 0.0, at))
 
 
 @kernel
 def cell(at, highest):
-    """Find the vertex before a position, one of the grid for NaN too, and how far towards the next it lies."""
+    """Find the vertex before a position, for NaN any of the grid, and the share of the way to the next vertex."""
     below = tl.where(at > 0, tl.minimum(tl.floor(at), highest), 0.0)
     return below, at - below
 
@@ -62,14 +62,14 @@ def _corners(points, along, across, low, scale, last, offsets, rows, weights, co
 
 
 def weighted(table: Tensor, rows: Tensor, weights: Tensor) -> Tensor:
-    """Do as :func:`ctm_plugin.rays.grid.weighted`."""
+    """Sum a table's rows by weights, ``[M, c]``, see :func:`ctm_plugin.rays.grid.weighted`."""
     values = table.new_empty(len(rows), table.shape[1])
     _go_over(*whole(table.detach(), rows, weights), values, back=False)
     return values
 
 
 def scattered(rows: Tensor, weights: Tensor, grad: Tensor, shape: torch.Size, sparse: bool) -> Tensor:
-    """Do as :func:`ctm_plugin.rays.grid.scattered`, in any order; never sparse."""
+    """Add up the gradient of weighted rows, see :func:`ctm_plugin.rays.grid.scattered`, in any order; never sparse."""
     table_grad = grad.new_zeros(shape)
     _go_over(table_grad, *whole(rows, weights, grad), back=True)
     return table_grad
@@ -88,7 +88,7 @@ def _look_up(
     table, rows, weights, numbers, count,
     BACK: tl.constexpr, CORNERS: tl.constexpr, CHANNELS: tl.constexpr, WIDTH: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Write the numbers ``[M, c]`` that the table has at the corners; ``BACK``: add them to it."""
+    """Write the table's weighted sums ``[M, c]`` at corners; ``BACK``: add the gradient ``numbers`` to the table."""
     m, channel = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK), tl.arange(0, WIDTH)
     there = m < count
     both, at = there[:, None] & (channel < CHANNELS)[None, :], numbers + m[:, None] * CHANNELS + channel[None, :]

@@ -1,4 +1,4 @@
-"""Samples outside free space, a program a ray: :func:`ctm_plugin.rays.occupancy.occupied_samples`."""
+"""Kernel of samples outside free space, one program a ray: :func:`ctm_plugin.rays.occupancy.occupied_samples`."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ def occupied_samples(
     origins: Tensor, directions: Tensor, first: Tensor, counts: Tensor, step: float, occupancy: Tensor,
     low: Tensor, scale: Tensor, last: Tensor, offsets: Tensor, contracted: bool = False,
 ) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
-    """Do as :func:`ctm_plugin.rays.occupancy.occupied_samples`: samples are counted, then written.
+    """Find samples in occupied cells (:func:`ctm_plugin.rays.occupancy.occupied_samples`): counted, then written.
 
-    The GPU is waited for once, for how many they are.
+    The host waits for the GPU once, for the number of samples.
     """
     given = *whole(origins, directions, first, counts, occupancy, low, scale, last), step
     kept, sizes = counts.new_empty(len(counts)), {"CONTRACTED": contracted, "BLOCK": SAMPLE_BLOCK, "num_warps": 2}
@@ -32,7 +32,7 @@ def occupied_samples(
 
 @kernel
 def _nearest(x, low, scale, last):
-    """The vertex next to a coordinate: to add and take off 2^23 rounds to whole numbers, halves to even ones."""
+    """Nearest vertex to a coordinate: adding and subtracting 2^23 rounds to whole numbers, halves to even ones."""
     at = place(x, tl.load(low), tl.load(scale), tl.load(last))
     return tl.where(at > 0, at + 8388608.0 - 8388608.0, 0.0).to(tl.int64)
 

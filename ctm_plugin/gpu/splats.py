@@ -1,4 +1,4 @@
-"""Gaussians on a picture, composited front to back by one program a tile, and the gradients of that."""
+"""Kernels that composite projected Gaussians front to back, one program a tile, and their gradients."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def rasterize(
     means: Tensor, conics: Tensor, opacities: Tensor, extents: Tensor, depths: Tensor, colors: Tensor, width: int,
     height: int,
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
-    """Do as :func:`ctm_plugin.splats.render.rasterize`, but leave light below 1e-4 where it is."""
+    """Composite Gaussians (:func:`ctm_plugin.splats.render.rasterize`), each tile until its light is below 1e-4."""
     flat = torch.cat([means, conics, opacities[:, None]], 1)
     wide, high = -(-width // TILE), -(-height // TILE)
     owner, starts = tiled(means.detach(), extents.detach(), depths.detach(), wide, high)
@@ -64,12 +64,12 @@ def tiled(means: Tensor, extents: Tensor, depths: Tensor, wide: int, high: int) 
 
 
 class Composited(torch.autograd.Function):
-    """The picture ``[C, H, W]`` of colours ``[N, C]``, and what is left of the light ``[H, W]``.
+    """Composite a picture ``[C, H, W]`` of colours ``[N, C]``, and its transmittance ``[H, W]``.
 
     Args:
-        flat: ``[N, 6]``, of each Gaussian the mean 2, the conic 3 and the opacity.
+        flat: ``[N, 6]``, each Gaussian's mean (2 numbers), conic (3) and opacity.
         owner, starts: see :func:`tiled`.
-        size: wide, and the picture's width and height in pixels.
+        size: number of tiles in a row, and the picture's width and height in pixels.
     """
 
     @staticmethod
@@ -97,7 +97,7 @@ class Composited(torch.autograd.Function):
 
 @kernel
 def pixels(tile, wide, width, height):
-    """Columns, rows and memory of a tile's pixels, and which of them are in the picture."""
+    """Columns, rows and memory offsets of a tile's pixels, and whether each lies in the picture."""
     number = tl.arange(0, PIXELS)
     x = (tile % wide) * SIDE + number % SIDE
     y = (tile // wide) * SIDE + number // SIDE
@@ -106,7 +106,7 @@ def pixels(tile, wide, width, height):
 
 @kernel
 def laid(flat, gaussian, listed, x, y):
-    """Alpha of a Gaussian at some pixels before it is cut to ``MAX_ALPHA``, 0 where it is too small, with its parts."""
+    """Alpha of a Gaussian at pixels, not yet cut to ``MAX_ALPHA``, 0 where it is too small; and its factors."""
     row = flat + gaussian * 6
     dx, dy = x - tl.load(row), y - tl.load(row + 1)
     a, b, c = tl.load(row + 2), tl.load(row + 3), tl.load(row + 4)
@@ -119,7 +119,7 @@ def laid(flat, gaussian, listed, x, y):
 def draw(
     flat, colors, owner, starts, image, left, ends, wide, width, height, CHANNELS: tl.constexpr, WIDTH: tl.constexpr
 ):  # fmt: skip
-    """Composite a tile's list, and write down where it was left."""
+    """Composite a tile's Gaussians, and write the position in its list where compositing stopped."""
     tile = tl.program_id(0)
     x, y, memory, inside = pixels(tile, wide, width, height)
     channel = tl.arange(0, WIDTH)
@@ -148,10 +148,10 @@ def draw_back(
     flat, colors, owner, starts, image, left, ends, d_image, d_left, d_flat, d_colors, wide, width, height,
     CHANNELS: tl.constexpr, WIDTH: tl.constexpr,
 ):  # fmt: skip
-    """Lay a tile's list once more, front to back, and add each Gaussian's gradients up.
+    """Composite a tile's Gaussians once more, front to back, and add up the gradients of each.
 
-    ``behind`` is what all that lies behind a Gaussian is worth at a pixel, by ``value`` what this one is: d alpha is
-    ``T value - behind / (1 - alpha)``.
+    ``value`` is the loss gradient's product with a Gaussian's colour at a pixel, ``behind`` the same for all light
+    behind it. So d alpha is ``T value - behind / (1 - alpha)``.
     """
     tile = tl.program_id(0)
     x, y, memory, inside = pixels(tile, wide, width, height)

@@ -1,4 +1,4 @@
-"""Every kernel is tried before it is used: on a small input, against the plain torch function it stands for."""
+"""Trial of every kernel before its first use: on a small input, against the plain torch function it stands for."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ import torch
 from torch import Tensor
 
 TOLERANCE = 2e-5
-"""Largest difference of results, as a share of the largest number: sums of some hundred numbers in float32."""
+"""Largest accepted difference of results, as a share of the largest number: float32 sums of some hundred numbers."""
 
 
 def tried(kernel: str, find: Callable[[], Callable], reference: Callable, device: torch.device) -> Callable:
-    """Give what ``find`` finds if it does on a device what ``reference`` does, else that, with a warning."""
+    """Give the kernel that ``find`` imports if it agrees with ``reference`` on a device, else that, with a warning."""
     try:
         run = find()
         with torch.autocast(device.type, enabled=False), torch.enable_grad():
@@ -31,7 +31,7 @@ def tried(kernel: str, find: Callable[[], Callable], reference: Callable, device
 
 
 def _apart(one: Tensor, other: Tensor) -> float:
-    """The largest difference as a share of the largest number; infinite for others' shapes, types and NaN."""
+    """Largest difference of two tensors as a share of the largest number; infinite if shapes, types or NaN differ."""
     if (one.shape, one.dtype) != (other.shape, other.dtype):
         return torch.inf
     one, other = one.detach().double(), other.detach().double()
@@ -40,7 +40,7 @@ def _apart(one: Tensor, other: Tensor) -> float:
 
 
 def _results(run: Callable, arguments: tuple) -> list[Tensor]:
-    """Results of a kernel, its arguments afterwards, and gradients."""
+    """Run a function; give its results, its arguments afterwards, and the arguments' gradients."""
     results, given = list(_leaves([run(*arguments)])), list(_leaves(arguments))
     wanted = [each for each in given if each.requires_grad]
     if wanted:
@@ -85,7 +85,7 @@ def _of_hashes(device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _of_splats(device: torch.device) -> tuple[Any, ...]:
-    """Faint ones all over a picture: no alpha lies at a bound, nor is a tile left."""
+    """Arguments for a trial: faint Gaussians all over a picture, so that no alpha meets a bound or ends a tile."""
     conics = torch.tensor([[0.001, 0.0002, 0.002]], device=device).repeat(9, 1)
     learned = 40 * _rand(device, 9, 2), conics, 0.1 + 0.1 * _rand(device, 9)
     extents, colors = torch.full((9, 2), 99.0, device=device), _rand(device, 9, 3).requires_grad_()
@@ -108,4 +108,4 @@ TRIALS: dict[str, Callable[[torch.device], tuple]] = {
     "splats:rasterize": _of_splats,
     "hash_grid:spread": lambda device: (_rand(device, 150, 4), *_of_hashes(device), torch.Size([381, 2])),
 }  # fmt: skip
-"""Makes the arguments with which each kernel is tried, the same each time; their blocks are not full."""
+"""Functions that make each kernel's arguments for its trial, the same each time; their last blocks are not full."""

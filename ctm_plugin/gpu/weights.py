@@ -1,4 +1,4 @@
-"""Weights of packed samples, a program a ray: :func:`ctm_plugin.rays.volume.volume_weights`."""
+"""Kernel of packed samples' rendering weights, one program a ray: :func:`ctm_plugin.rays.volume.volume_weights`."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ SAMPLE_BLOCK = 64
 
 
 class VolumeWeights(torch.autograd.Function):
-    """As :class:`ctm_plugin.cpu.weights.VolumeWeights`; sums are of float64."""
+    """Volume rendering weights, as :class:`ctm_plugin.cpu.weights.VolumeWeights`; sums are of float64."""
 
     @staticmethod
     def forward(ctx, optical_depth: Tensor, ray_index: Tensor, n_rays: int) -> tuple[Tensor, Tensor]:
@@ -36,7 +36,7 @@ class VolumeWeights(torch.autograd.Function):
 
 @kernel
 def _alpha(depth):
-    """``1 - exp(-depth)``, by its series where the difference would have few digits."""
+    """Alpha of an optical depth, ``1 - exp(-depth)``, by its series where the difference would have few digits."""
     series = 1 - depth / 4 * (1 - depth / 5 * (1 - depth / 6 * (1 - depth / 7)))
     series = depth * (1 - depth / 2 * (1 - depth / 3 * series))
     return tl.where(depth < 0.25, series, 1 - tl.exp(-depth))
@@ -44,7 +44,7 @@ def _alpha(depth):
 
 @kernel
 def _solid(depth):
-    """What is summed: nothing passes exp(-100), and more would drown its neighbours."""
+    """Optical depth cut for summation: nothing passes exp(-100), and larger depths would drown their neighbours."""
     return tl.where(depth > 100.0, 100.0, depth).to(tl.float64)
 
 

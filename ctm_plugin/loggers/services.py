@@ -1,4 +1,4 @@
-"""Lightning's own loggers, with a run's folder and the step that it resumes from."""
+"""Lightning's loggers of CSV, TensorBoard, Weights & Biases and MLflow, made to resume in a run's folder."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from ctm_plugin.loggers.settings import MLflowConfig, WandBConfig
 from ctm_plugin.metrics.table import METRICS
 
 BINS = np.linspace(0, 1, 65)
-"""Edges of the histograms."""
+"""Edges of the histograms' 64 bins in [0, 1]."""
 CHARTS = {
     "Losses": {
         "on colours: color without CTM, enc and dec with it": r"loss/(color|enc|dec)$",
@@ -38,7 +38,7 @@ CHARTS = {
 }
 """Charts that TensorBoard gets besides those of metrics, as regular expressions over tags."""
 TRAIN_CHARTS = {"": r"psnr/rgb$", " in the latent space": r"psnr/latent$"}
-"""Charts of the training's PSNR by what follows their title."""
+"""Charts of the training's PSNR, as regular expressions over tags, by suffix of their title."""
 
 
 class CSV(RunLogger, CSVLogger):
@@ -49,7 +49,7 @@ class CSV(RunLogger, CSVLogger):
         self.last = step
 
     def open(self) -> None:
-        """Begin the table with the rows that a resumed run goes on from, as Lightning's deletes them."""
+        """Begin the table with a resumed run's rows up to its step, as Lightning's logger deletes them."""
         path, rows = Path(self.log_dir, "metrics.csv"), []
         if self.last and path.is_file():
             try:
@@ -116,7 +116,7 @@ class TensorBoard(RunLogger, TensorBoardLogger):
 
 
 def layout() -> dict[str, dict[str, list]]:
-    """Lay out all charts. The same for all runs: TensorBoard merges the layouts that it finds."""
+    """Lay out TensorBoard's charts, alike for all runs: TensorBoard merges the layouts that it finds."""
     quality = {chart: f"{tag}$" for tag, chart in (metric.curve for metric in METRICS.values() if metric.curve)}
     quality |= {f"PSNR of the training pixels{end}": tag for end, tag in TRAIN_CHARTS.items()}
     charts = {"Quality": quality} | CHARTS
@@ -189,15 +189,15 @@ class MLflow(RunLogger, MLFlowLogger):
 
 
 def sweep_of(run: Path) -> str | None:
-    """Name the sweep that a run is of, by its folder; ``None`` for a single run."""
+    """Name the sweep that a run belongs to, by its folder; ``None`` for a single run."""
     return run.parent.name if (run.parent / "multirun.yaml").is_file() else None
 
 
 def kept_id(file: Path) -> str | None:
-    """Read what a service calls a run, out of the run's folder; ``None`` for a new run.
+    """Read a service's id of a run out of a file in the run's folder; ``None`` for a new run.
 
     Raises:
-        CheckpointError: it is something else.
+        CheckpointError: the file holds no id.
     """
     found = file.read_text(encoding="utf-8", errors="replace") if file.is_file() else None
     if found is not None and not re.fullmatch(r"[A-Za-z0-9_-]{1,64}", found):

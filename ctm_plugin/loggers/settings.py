@@ -20,6 +20,6 @@ class WandBConfig(Settings, section="logger"):
 
 @dataclass(frozen=True, kw_only=True)
 class MLflowConfig(Settings, section="logger"):
-    """Where runs go."""
+    """Settings of MLflow: where runs go."""
 
     experiment: str = setting("ctm_plugin", "experiment that runs are put into")

@@ -20,7 +20,7 @@ BRIGHTNESS_CLASSES, FLAT_SHARE = 3, 0.15
 """Number of classes of brightness, as noise depends on light, and the share of each class's squares that counts as
 flat."""
 MIN_BAND = 1e-6
-"""Least absolute value of the fine band; smaller ones are float32's rounding of flat areas."""
+"""Least absolute value of a picture's fine band; smaller ones are float32's rounding of flat areas."""
 MIN_DETAIL = 0.05
 """Least share of the photograph's fine variance that must be detail for a score: noise is not known more exactly."""
 MIN_SQUARES = 40

@@ -29,9 +29,9 @@ class Scoring:
     """Metrics, data settings and light that a backbone scores itself with.
 
     Attributes:
-        dataset: the data set's part of the run's configuration, for the protocol.
+        dataset: the data set's section of the run's configuration, for the ``protocol`` of the scores.
         lpips: what :func:`ctm_plugin.metrics.lpips_weights.load_lpips` returned.
-        light: what lit pictures are shown in, see :func:`ctm_plugin.color.light.chosen_light`.
+        light: light that pictures are displayed in, see :func:`ctm_plugin.color.light.chosen_light`.
         track: ``track(items, what)`` gives the items back and shows how many are done; by default it shows nothing.
     """
 
@@ -63,14 +63,14 @@ def summarize(
     Args:
         names: one name a view, of at least one.
         predictions: decoded RGB, ``[N, H, W, 3]`` in [0, 1], or a sequence of ``[H, W, 3]``.
-        targets: the images as captured, the same shapes; ``None`` for a view that was not.
+        targets: the images as captured, the same shapes; ``None`` for a view without a photograph.
         exposure: light relative to a normal exposure, ``None`` where it is not known.
         depths, true_depths: distances along the ray in scene units, ``[N, H, W]``; NaN in ``true_depths``: no surface.
             Depth is scored where both are given.
         lpips: what :func:`ctm_plugin.metrics.lpips_weights.load_lpips` returned.
         masks: which pixels count, ``[H, W]`` a view; ``None``: all do.
         references: the views in normal light, of the predictions' shapes, where there are such pictures.
-        light: what predictions are compared with them in.
+        light: light in which predictions are compared with the references.
         details: of each view, see :func:`ctm_plugin.metrics.detail.detail_moments`; ``None``: detail is not scored.
 
     Returns:
@@ -156,12 +156,12 @@ def is_measurement(config: Mapping[str, Any]) -> bool:
 
 
 def no_measurement(steps: int | str) -> str:
-    """The remark on scores that mean nothing."""
+    """The remark that scores after so few steps mean nothing."""
     return f"{steps} steps: a test of the command, not a measurement"
 
 
 def _depth_errors(depth: Tensor, true: Tensor, mask: Tensor | None) -> Float64[Tensor, " pixels"]:
-    """``|depth - true|`` of the pixels that count and show a surface, scene units."""
+    """Absolute depth errors of the pixels that count and show a surface, in scene units."""
     counted = true.isfinite() if mask is None else true.isfinite() & mask
     return (depth[counted].double() - true[counted].double()).abs()
 
@@ -175,5 +175,5 @@ def _of_all(metric: Metric, views: Sequence[View], of_each: Sequence[float | Non
 
 
 def _number(value: float | None) -> float | None:
-    """JSON has no NaN and no infinity: ``None`` instead."""
+    """Replace NaN and infinity, which JSON has not, by ``None``."""
     return value if value is not None and math.isfinite(value) else None

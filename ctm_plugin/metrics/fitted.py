@@ -17,7 +17,7 @@ from ctm_plugin.metrics.rendered import Lit
 def psnr_fitted(
     prediction: Float[Tensor, "h w 3"], target: Float[Tensor, "h w 3"], mask: Bool[Tensor, "h w"] | None = None
 ) -> float | None:
-    """PSNR of the right half after the matrix that fits the left half best, see :func:`fit_light`.
+    """PSNR of a view's right half after the colour matrix that fits its left half best, see :func:`fit_light`.
 
     No pixel that is scored has a part in the fit. It is the same map for all kinds of ``appearance``, none included, so
     that their scores can be compared.
@@ -69,7 +69,7 @@ def lit_views(
         predictions, targets: as rendered and as photographed, dark; ``None``: there is no photograph.
         references: the views in normal light.
         masks: which pixels count; ``None``: all do.
-        light: what both are shown in.
+        light: light in which predictions and photographs are brightened.
     """
     rendered = [light.apply(prediction) for prediction in predictions]
     colors = fit_colors(rendered, references, masks)
@@ -99,5 +99,5 @@ def fit_colors(
 
 
 def map_colors(image: Float[Tensor, "h w 3"], colors: Float64[Tensor, "4 3"]) -> Float[Tensor, "h w 3"]:
-    """An affine map of colours, clipped to [0, 1]."""
+    """Apply an affine map ``[4, 3]`` to an image's colours, clipped to [0, 1]."""
     return (image.double() @ colors[:3] + colors[3]).clamp(0.0, 1.0).to(image.dtype)

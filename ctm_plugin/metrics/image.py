@@ -108,7 +108,7 @@ def best_constant_psnr(
 
 
 def pixels_that_count(image: Float[Tensor, "h w 3"], mask: Bool[Tensor, "h w"] | None) -> Float[Tensor, "p 3"]:
-    """The pixels of an image, of those a mask leaves."""
+    """The pixels ``[P, 3]`` of an image that count: all, or those where the mask is true."""
     return image.flatten(0, 1) if mask is None else image[mask]
 
 

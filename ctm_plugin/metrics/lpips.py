@@ -37,7 +37,7 @@ MIN_SIDE = {"alex": 31, "vgg": 16}
 
 
 def feature_network(net: Net) -> nn.Sequential:
-    """The convolutions of torchvision's ``features``, same indices."""
+    """Build the convolutions of AlexNet or VGG-16, with the indices of torchvision's ``features``."""
     layers: list[nn.Module] = []
     channels = 3
     for each in CONVOLUTIONS[net]:

@@ -27,11 +27,11 @@ URLS = {
 }
 """Addresses of the networks' weights."""
 MEGABYTES = {"alex": 233, "vgg": 528}
-"""Size of each of these files in megabytes."""
+"""Size in megabytes of the file of each network's weights."""
 HEAD_FILE = "functional/image/lpips_models/{}.pth"
 """Path inside torchmetrics of the weights of LPIPS' linear layers."""
 LOAD_ERRORS = (DataError, OSError, HTTPException, EOFError, UnpicklingError, KeyError, ValueError, RuntimeError)
-"""Errors of reading or downloading such a file, and of a network that is given other weights."""
+"""Errors of reading or downloading a file of weights, and of a network that is given other weights."""
 TIMEOUT_S = 4.0
 """Seconds without an answer after which a download is given up."""
 MAX_BYTES = 2**30
@@ -98,7 +98,7 @@ def read_weights(path: Path) -> Mapping[str, Tensor]:
 
 
 def _download(net: Net) -> Path:
-    """Torchvision's file in torch.hub's cache, where it is put if need be, after a line that says so."""
+    """Find torchvision's weights in torch.hub's cache, or download them there after a line that says so."""
     url = URLS[net]
     path = Path(torch.hub.get_dir(), "checkpoints", PurePosixPath(url).name)
     if path.exists():

@@ -10,7 +10,7 @@ import torch
 
 @contextmanager
 def full_float32(device: torch.device) -> Iterator[None]:
-    """Inside, convolutions on ``device`` run in plain float32: no autocast, no TF32, deterministic kernels.
+    """Context in which convolutions on ``device`` run in plain float32: no autocast, no TF32, deterministic kernels.
 
     SSIM subtracts nearly equal moments, and TF32's ten bits do not survive that.
     """

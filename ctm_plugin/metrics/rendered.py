@@ -1,4 +1,4 @@
-"""Inputs of metrics: a rendered view with its picture, patches with their true place."""
+"""Inputs of metrics: a rendered view with its photograph, aligned patches with their true homographies."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from ctm_plugin.metrics.lpips import LPIPS
 
 @dataclass(frozen=True)
 class Lit:
-    """One view in normal light, and three tries at it. All in [0, 1].
+    """A view photographed in normal light, and three estimates of that photograph. All in [0, 1].
 
     Attributes:
-        reference: the picture that was taken in normal light.
-        rendered: the rendering in the one light of the scene.
-        photo: the dark photograph of the view itself in it: what light can give; ``None`` where
+        reference: the photograph that was taken in normal light.
+        rendered: the rendering, brightened by the scene's one light.
+        photo: the view's dark photograph, brightened alike: the best that brightening can give; ``None`` where
             there is none.
         fitted: ``rendered`` after the colour map that fits the references best, an oracle: see
             :func:`ctm_plugin.metrics.fitted.fit_colors`.
@@ -34,11 +34,11 @@ class View:
     """A rendered test view.
 
     Attributes:
-        prediction, target: decoded RGB and the picture as captured, in [0, 1]; ``None`` where there is no such picture,
-            of which then no metric of such pictures is asked.
-        gain: what ``psnr_enhanced`` brightens both by, see :func:`ctm_plugin.color.light.enhancement_gain`.
-        lpips: the network; ``None`` where there is none, or the view is too small for it.
-        depth_errors: of pixels that show a surface, scene units; ``None`` where no depth is known.
+        prediction, target: decoded RGB and the photograph as captured, in [0, 1]; ``None`` where there is none: the
+            metrics that compare with it are then left out.
+        gain: factor by which ``psnr_enhanced`` brightens both, see :func:`ctm_plugin.color.light.enhancement_gain`.
+        lpips: the LPIPS network; ``None`` where there is none, or the view is too small for it.
+        depth_errors: absolute errors of pixels that show a surface, scene units; ``None`` where no depth is known.
         mask: which pixels count; ``None``: all do.
         lit: the view in normal light; ``None`` where there is no picture of it.
         detail: see :func:`ctm_plugin.metrics.detail.detail_moments`; ``None`` where there are none.
@@ -60,9 +60,9 @@ class Alignment:
 
     Attributes:
         rendered, clean: the patches as rendered, and without noise.
-        fused, picture: the whole picture as rendered in the first patch's frame, which is its own, and as it is.
-        warps, true_warps: parameters of the homographies.
-        gain: how dark the picture is, see :func:`ctm_plugin.color.light.enhancement_gain`.
+        fused, picture: the whole picture as rendered, in the first patch's frame, and the true picture.
+        warps, true_warps: learned and true parameters of the homographies.
+        gain: factor that brightens the picture, see :func:`ctm_plugin.color.light.enhancement_gain`.
     """
 
     rendered: Float[Tensor, "n p p 3"]

@@ -29,25 +29,25 @@ PLACES = ("run", "sweep", "report", "demo")
 
 @dataclass(frozen=True, kw_only=True)
 class Metric:
-    """A number of a run.
+    """A metric: a number of a run, how it is computed, and where it is printed.
 
     Attributes:
         label: its name for people.
-        about: what it is, in a sentence without a full stop, for the documentation.
+        about: what the metric is, in a sentence without a full stop, for the documentation.
         higher: whether more is better.
-        unit: behind the number.
+        unit: unit printed behind the number.
         decimals: how many are printed.
-        thousands: whether commas part them.
-        view: of one test view, ``None`` where it cannot be computed; it goes into ``per_image``.
-        lit: whether it is of views of which there is a picture in normal light (``View.lit``), not of those of which
-            there is one as captured (``View.target``); runs without such pictures do not have it.
-        views: of all test views; unless given, the mean of ``view``, and ``None`` where one view has none.
-        alignment: of aligned patches; a number a patch, ``[n]``, goes into ``per_patch``, and its mean is the score.
+        thousands: whether commas separate thousands.
+        view: computes the number of one test view, ``None`` where it cannot; it goes into ``per_image``.
+        lit: whether it scores views that have a photograph in normal light (``View.lit``), not those that have one as
+            captured (``View.target``); runs without such photographs do not have it.
+        views: computes the number of all test views; by default the mean of ``view``, ``None`` where a view has none.
+        alignment: computes a number for each aligned patch, ``[n]``, for ``per_patch``; the mean is the score.
         told: the :data:`PLACES` that show it.
         order: metrics with smaller numbers come first.
         brief: the label where there is little room; ``label`` unless given.
-        curve: TensorBoard's tag and chart for it while a field trains, of a small rendering of one view.
-        dark: whether only dark pictures have its curve.
+        curve: TensorBoard's tag and chart of the metric while a field trains, of a small rendering of one view.
+        dark: whether only dark pictures have the metric's curve.
         differing: whether a run shows it only where its photographs differ (``appearance``).
     """
 
@@ -69,7 +69,7 @@ class Metric:
     differing: bool = False
 
     def counts(self, view: View) -> bool:
-        """Whether a test view has what this is of."""
+        """Whether a test view has the photograph that the metric compares with."""
         return (view.lit if self.lit else view.target) is not None
 
     @property
@@ -78,18 +78,18 @@ class Metric:
 
     @property
     def of(self) -> tuple[str, ...]:
-        """Which scenes have it, of ``views`` and ``patches``; empty: it is of the training, and all runs have it."""
+        """Kinds of scenes that have the metric, ``views`` or ``patches``; empty: all runs have it, as of training."""
         kinds = {"views": self.view or self.views, "patches": self.alignment}
         return tuple(kind for kind, function in kinds.items() if function)
 
     def text(self, value: float) -> str:
-        """A value with its unit."""
+        """Format a value of the metric with its unit."""
         number = f"{value:{',' if self.thousands else ''}.{self.decimals}f}"
         return f"{number} {self.unit}" if self.unit else number
 
 
 def corner_errors(alignment: Alignment) -> Float[Tensor, " n"]:
-    """Mean distance of each patch's four corners from where they belong, in pixels of the picture."""
+    """Mean distance of each patch's four corners from their true positions, in pixels of the picture."""
     height, width = alignment.picture.shape[:2]
     corners = patch_corners(height, width, alignment.clean.shape[1]).to(alignment.warps)
     at, belongs = (to_pixels(warp(corners, sl3_exp(h)), height, width) for h in (alignment.warps, alignment.true_warps))
@@ -114,7 +114,7 @@ def _ssim(prediction: Tensor, target: Tensor, view: View) -> float | None:
 
 
 def _lpips(prediction: Tensor, target: Tensor, view: View) -> float | None:
-    """Pixels that do not count are the target's in both."""
+    """LPIPS of a view, with masked pixels replaced by the target's; ``None`` without a network."""
     if view.lpips is None:
         return None
     counted = prediction if view.mask is None else prediction.where(view.mask[..., None], target)
@@ -122,7 +122,7 @@ def _lpips(prediction: Tensor, target: Tensor, view: View) -> float | None:
 
 
 def of_lit(which: str, suffix: str, told: tuple[str, ...], label: str, about: str) -> dict[str, Metric]:
-    """PSNR, SSIM and LPIPS of a picture of :class:`~ctm_plugin.metrics.rendered.Lit` against its reference."""
+    """PSNR, SSIM and LPIPS entries of a picture of :class:`~ctm_plugin.metrics.rendered.Lit` against the reference."""
 
     def entry(name: str, score: Callable[[Tensor, Tensor, View], float | None], **more: Any) -> Metric:
         def of_view(view: View) -> float | None:
@@ -236,7 +236,7 @@ METRICS: dict[str, Metric] = {
 
 @cache
 def add_others() -> None:
-    """Put the metrics of other packages behind ours: not on import, as these packages import this module.
+    """Add the metrics of other packages to ``METRICS``: not on import, as these packages import this module.
 
     Raises:
         CTMError: one cannot be imported.

@@ -43,7 +43,7 @@ class GridAdam(Optimizer):
         step_table(table, table.grad, *moments, group["rates"], state["step"], *map(group.get, ("lr", "betas", "eps")))
 
     def state_dict(self) -> dict[str, Any]:
-        """Save what the base class does; ``rates`` follow from the data and are not saved."""
+        """Give the state of the base class without ``rates``, which follow from the data."""
         saved = super().state_dict()
         for group in saved["param_groups"]:
             group["rates"] = None

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 
 class Turn(NamedTuple):
-    """From ``step`` on, where the schedule is at ``place``, what is left of it ends with step ``end``."""
+    """A change of pace: from ``step`` on, at ``place`` of the schedule, its rest ends with step ``end``."""
 
     step: int
     place: float
@@ -23,7 +23,7 @@ class Pace:
 
     Args:
         planned: steps of the schedule, >= 1.
-        turns: of a checkpoint.
+        turns: changes of pace up to now, out of a checkpoint.
     """
 
     def __init__(self, planned: int, turns: list[tuple[int, float, int]] | None = None):
@@ -32,7 +32,7 @@ class Pace:
 
     @property
     def end(self) -> int:
-        """Steps that the training takes in all, as far as is known."""
+        """Number of steps of the whole training, as the latest turn has it."""
         return self.turns[-1].end
 
     def place(self, step: int) -> float:

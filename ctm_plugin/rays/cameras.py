@@ -24,7 +24,7 @@ class Rays(NamedTuple):
         return Rays(self.origins[index], self.directions[index])
 
     def points(self, t: Float[Tensor, " m"], ray_index: Int[Tensor, " m"]) -> Float[Tensor, "m 3"]:
-        """Find where packed samples lie: ``origins[ray_index] + t directions[ray_index]``.
+        """Find the positions of packed samples: ``origins[ray_index] + t directions[ray_index]``.
 
         One coordinate after another in memory (strides 1 and M): what follows takes them one by one.
         """
@@ -139,8 +139,8 @@ def pixel_rays(
     right: float = 0.0,
     down: float = 0.0,
 ) -> Rays:
-    """Make rays through pixel centres, by flat index ``(view * height + row) * width + column``; or through points so
-    far right and down of them, in pixels.
+    """Make rays through pixel centres, by flat index ``(view * height + row) * width + column``; or through points
+    ``right`` and ``down`` of these centres, in pixels.
     """
     view = pixel.div(height * width, rounding_mode="floor")
     row = pixel.div(width, rounding_mode="floor") % height

@@ -48,7 +48,7 @@ def lengths(pace: Float[Tensor, " n"], points: Float[Tensor, "n 3"]) -> Float[Te
     the ball makes of the length of a ray that leaves it straight.
 
     Args:
-        pace: where they lie along their rays.
+        pace: paces of the points along their rays.
         points: contracted.
     """
     along = (travelled(pace) / UNIFORM_DISTANCE).clamp_min(1.0)

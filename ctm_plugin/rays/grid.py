@@ -81,8 +81,8 @@ class VoxelGrid(nn.Module):
         return torch.stack([axis[at] for axis, at in zip(self.axes(), index, strict=True)], dim=-1)
 
     def box_around(self, chosen: Bool[Tensor, " v"]) -> Float[Tensor, "2 3"]:
-        """Bound the cells, half a voxel to all sides, of the chosen vertices, within the box; turned inside out where
-        there are none."""
+        """Bound the cells, half a voxel to all sides, of the chosen vertices, within the grid's box; without vertices
+        the box has its corners exchanged."""
         volume, ends = chosen.view(self.shape), []
         for axis, others in zip(self.axes(), ((1, 2), (0, 2), (0, 1)), strict=True):
             some = volume.any(others[1]).any(others[0])
@@ -102,7 +102,7 @@ def _rows(index: Int[Tensor, "m 3"], offsets: Int[Tensor, " 8"]) -> Int[Tensor, 
 
 
 def nearest_rows(points: Tensor, low: Tensor, scale: Tensor, last: Tensor, offsets: Tensor) -> Tensor:
-    """Do as :meth:`VoxelGrid.nearest`, with a grid's lowest corner and buffers."""
+    """Find the rows ``[M]`` of the vertices nearest to points ``[M, 3]``, given a grid's lowest corner and buffers."""
     return _rows(_position(points, low, scale, last).round_().int(), offsets)
 
 
@@ -161,13 +161,13 @@ def weighted(table: Tensor, rows: Tensor, weights: Tensor) -> Tensor:
 
 @looped("lookup:gradient", kernel="lookup:scattered")
 def scattered(rows: Tensor, weights: Tensor, grad: Tensor, shape: torch.Size, sparse: bool) -> Tensor:
-    """Add up the gradient of :func:`weighted`, for a table of that shape; a loop's may be ``sparse``.
+    """Add up the gradient of :func:`weighted` for a table of that shape; the CPU loop may give it ``sparse``.
 
     Args:
         rows, weights: ``[M, 8]``.
         grad: ``[M, c]``.
         shape: (V, c).
-        sparse: whether the result may be.
+        sparse: whether the result may be a sparse tensor.
     """
     spread = (grad[:, None, :] * weights[:, :, None]).flatten(0, 1)
     # 64-bit indices: with 32-bit ones torch leaves its fast path on the CPU and takes ten times as long.
@@ -208,7 +208,7 @@ def resample(table: Float[Tensor, "v c"], old: Shape, new: Shape) -> Float[Tenso
 
 
 def _places(old: int, new: int) -> tuple[Tensor, Tensor]:
-    """Positions of a side's new vertices: the old one before, and the share of the way to the next."""
+    """Positions of a resampled side's new vertices: the old vertex before each, and the share of the way on."""
     place = torch.arange(new, dtype=torch.float64) * ((old - 1) / (new - 1))
     low = place.floor().clamp_(max=old - 2)
     return low.long(), (place - low).float()

@@ -1,4 +1,4 @@
-"""Densities out of a hash grid and a small network, without gradients: which samples are worth one.
+"""Densities out of a hash grid and a small network, without gradients, to choose the samples that are worth one.
 
 The network has one hidden layer with a ReLU; of what it gives only the first number is looked at, the logarithm of the
 density.
@@ -23,7 +23,7 @@ MAX_LOG_DENSITY = 15.0
 def log_density(
     table: Tensor, sides: Tensor, starts: Tensor, first: nn.Linear, last: nn.Linear, points: Tensor
 ) -> Tensor:
-    """Evaluate the network at points: ``[M]``.
+    """Evaluate the logarithm of the density, ``[M]``, at points.
 
     Args:
         table, sides, starts: of a hash grid, see :func:`ctm_plugin.rays.hash_grid.encoded`.
@@ -45,7 +45,7 @@ def lit(
 
     Args:
         table, sides, starts, first, last, points: see :func:`log_density`.
-        lengths: of the samples, ``[M]`` or ``[1]``: that of all.
+        lengths: lengths of the samples, ``[M]``, or ``[1]``: one for all.
         ray_index: ``[M]``, ascending.
         n_rays: R.
         threshold: in [0, 1).
@@ -63,5 +63,5 @@ def lit(
 
 
 def _first(features: Tensor, first: nn.Linear, last: nn.Linear) -> Tensor:
-    """The network's first number, ``[M]`` float32."""
+    """The network's first output, the logarithm of the density, ``[M]`` float32."""
     return F.linear(first(features).relu(), last.weight[:1], last.bias[:1]).squeeze(1).float()

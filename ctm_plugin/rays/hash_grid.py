@@ -29,7 +29,7 @@ def resolutions(levels: int, coarsest: int, finest: int) -> list[int]:
 
 
 class HashGrid(nn.Module):
-    """The tables of all levels, one after another, and how they are looked up.
+    """Multiresolution hash grid: the feature tables of all levels, one after another, and their lookup.
 
     Args:
         levels: L.
@@ -53,7 +53,7 @@ class HashGrid(nn.Module):
         """Encode points in [0, 1]^3: L F features each, by level; differentiable in the table only.
 
         Args:
-            points: where.
+            points: positions in the unit cube.
             known: the features themselves, if they were looked up before.
         """
         return _Encoded.apply(self.table, points, self.sides, self.starts, known)
@@ -89,7 +89,7 @@ def hashed_corners(
     ends, shares = torch.stack([below, below + 1], dim=-1), torch.stack([1 - into, into], dim=-1)  # [M, L, 3, 2]
 
     def along(axis: int, ends: Tensor) -> Tensor:
-        """``[M, L, z, y, x]``, of which one axis has a length of 2, the others of 1."""
+        """View an axis's two ends as ``[M, L, z, y, x]``: that axis has length 2, the others 1."""
         return ends[:, :, axis].unflatten(2, [2 if each == axis else 1 for each in (2, 1, 0)])
 
     rows, across = starts.diff(), sides + 1
@@ -129,7 +129,7 @@ def spread(grad: Tensor, points: Tensor, sides: Tensor, starts: Tensor, shape: t
 
     Args:
         grad: ``[M, L F]``.
-        points, sides, starts: as there.
+        points, sides, starts: see :func:`encoded`.
         shape: (V, F).
     """
     table_grad = grad.new_zeros(shape)

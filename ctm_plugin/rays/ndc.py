@@ -31,7 +31,7 @@ class NDC(NamedTuple):
     near: float
 
     def rays(self, rays: Rays) -> Rays:
-        """Give the same lines in NDC: ``t`` = 0 on the near plane, 1 at infinity. Directions are not of unit length.
+        """Transform rays into NDC: ``t`` = 0 on the near plane, 1 at infinity. Directions are not of unit length.
 
         Args:
             rays: R rays in the world, directions with z < 0.
@@ -47,7 +47,7 @@ class NDC(NamedTuple):
         )
 
     def points(self, points: Float[Tensor, "m 3"]) -> tuple[Float[Tensor, "m 3"], Float[Tensor, " m"]]:
-        """Give points of the world in NDC, and how far ``t`` goes there for a unit of depth: ``near / depth^2``.
+        """Transform points of the world into NDC; give also the change of ``t`` a unit of depth, ``near / depth^2``.
 
         Args:
             points: with z < 0; what lies nearer than a thousandth of ``near`` counts as there.

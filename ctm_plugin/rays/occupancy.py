@@ -1,4 +1,4 @@
-"""The occupancy grid: of samples along rays, those that no free space holds, and rays that may have some.
+"""The occupancy grid: samples along rays outside free space, and rays that may have such samples.
 
 A vertex of a :class:`~ctm_plugin.rays.grid.VoxelGrid` stands for its cell, half a voxel to all sides; a table ``[V]``
 of booleans says which are occupied.
@@ -29,7 +29,7 @@ def occupied_samples(
     Args:
         origins, directions: ``[R, 3]``.
         first: ``[R]``, where each ray's samples begin.
-        counts: ``[R]``, how many they are.
+        counts: ``[R]``, number of samples on each ray.
         occupancy: ``[V]`` boolean.
         low, scale, last, offsets: the lowest corner of the occupancy's grid, and its buffers.
         contracted: samples are at paces, and points in the ball, of :mod:`ctm_plugin.rays.contraction`.

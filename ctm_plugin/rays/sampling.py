@@ -80,7 +80,7 @@ def march(
 def pack_samples(
     first: Float[Tensor, " r"], counts: Int[Tensor, " r"], step: float
 ) -> tuple[Float[Tensor, " m"], Int[Tensor, " m"]]:
-    """Pack samples at ``first + j step``, j < counts, and the ray of each."""
+    """Place ``counts`` samples on each ray at ``first + j step``, packed; give their distances and ray indices."""
     ends = counts.cumsum(0)
     total = int(ends[-1]) if len(ends) else 0  # a GPU is waited for once; not knowing it, torch waits twice
     ray_index = torch.repeat_interleave(torch.arange(len(counts), device=counts.device), counts, output_size=total)

@@ -92,7 +92,7 @@ def occlusion(weights: Float[Tensor, " m"], s: Float[Tensor, " m"], n_rays: int)
 
 
 def table_weights(optical_depth: Float[Tensor, "r s"]) -> tuple[Float[Tensor, "r s"], Float[Tensor, " r"]]:
-    """Do as :func:`volume_weights`, for a table of samples.
+    """Weigh a table of samples, and find each ray's transmittance, by the formulas of :func:`volume_weights`.
 
     Args:
         optical_depth: of each sample, >= 0, samples of a ray in order.

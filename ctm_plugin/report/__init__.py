@@ -1,1 +1,1 @@
-"""Finished runs, gathered into the paper's tables."""
+"""Reports: tables and pages that compare finished runs, in the form of the paper's tables."""

@@ -1,4 +1,4 @@
-"""Runs into cells: means over seeds and scenes, ranks, and paired differences with their intervals."""
+"""Cells of tables out of runs: means over seeds and scenes, ranks, paired differences with intervals."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from ctm_plugin.report.runs import Run
 CONFIDENCE = 0.95
 """Level of the confidence intervals."""
 Rows = Sequence[tuple[str, list[Run]]]
-"""Labels of rows with the runs of each."""
+"""Rows of a table: each row's label and its runs."""
 
 
 @dataclass(frozen=True)
 class Column:
-    """A metric, over all scenes or on one of them."""
+    """A column of a table: a metric, over all scenes or on one."""
 
     label: str
     metric: str
@@ -34,13 +34,13 @@ class Column:
 
 
 class Difference(NamedTuple):
-    """Difference of a row's runs from another's of the same scene and seed."""
+    """Mean difference between two rows' runs, paired by scene and seed."""
 
     against: str
-    """The other row's label."""
+    """Label of the row that is subtracted."""
     mean: float
     half: float | None
-    """Half the width of the 95 % confidence interval (Student's t, all pairs alike); of two or more pairs."""
+    """Half the width of the 95 % confidence interval (Student's t over pairs), for two or more pairs."""
     pairs: int
     better: bool | None
     """Whether the difference is an improvement, where the interval excludes 0."""
@@ -48,7 +48,7 @@ class Difference(NamedTuple):
 
 @dataclass
 class Cell:
-    """One setting's score."""
+    """A table's cell: the score of one row in one column."""
 
     mean: float | None = None
     """Mean over scenes of the means over seeds, converged or not; ``None``: no run has it, or none converged."""
@@ -62,7 +62,7 @@ class Cell:
     not_converged: int = 0
     runs: int = 0
     paper: float | None = None
-    """The paper's value, or another that was published; ``math.nan``: N.C. there."""
+    """The published value, of the paper or another one; ``math.nan``: published as N.C."""
     rank: int = 0
     """Rank in the column: 1 for the best, 2 for the second best."""
     differences: list[Difference] = field(default_factory=list)
@@ -79,7 +79,7 @@ class Table:
     title: str
     columns: list[Column]
     data: str = ""
-    """Data that the paper's values were measured on; empty: there are none, or they have rows of their own."""
+    """Data set of the paper's values; empty: the table has none, or they have rows of their own."""
     rows: list[tuple[str, list[Cell]]] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
 
@@ -90,13 +90,13 @@ class Table:
         expected: int = 1,
         references: Callable[[list[Run], Column], Iterable[tuple[str, list[Run]]]] = lambda runs, column: (),
     ) -> None:
-        """Fill in rows, ranked among each other column by column: a cell that lacks a scene is not ranked.
+        """Add rows to the table, ranked among each other in each column; a cell that lacks a scene is not ranked.
 
         Args:
-            rows: the runs of each.
-            before: what their labels begin with.
-            expected: how many scenes there are.
-            references: the rows that a row's runs are compared with in a column.
+            rows: labels and runs of the rows.
+            before: prefix of the labels.
+            expected: number of scenes.
+            references: function that gives the rows with which a row's runs are compared in a column.
         """
         grid = [[cell_of(runs, column, 1 if column.scene else expected) for column in self.columns] for _, runs in rows]
         for column, cells in zip(self.columns, zip(*grid, strict=True), strict=True):

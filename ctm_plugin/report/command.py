@@ -1,4 +1,4 @@
-"""Finished runs as tables."""
+"""The verb ``report``: tables of finished runs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What sets runs apart: names of their scenes and rows by the settings in which they differ."""
+"""Names of scenes and rows in a report, by the settings in which their runs differ."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from ctm_plugin.report.runs import Run, Setting, read_runs, weights
 from ctm_plugin.runs.rundir import METRICS
 
 MAX_KEYS = 6
-"""Most keys that all name a row; of more, only those that tell runs apart do: two versions differ in dozens."""
+"""Most keys that name a row without selection; of more, as between two versions, only distinguishing ones do."""
 BACKGROUNDS, BUDGET, GEOMETRY = "dataset.background_level", "trainer.budget", "dataset.geometry"
 CAUSE_KEYS = (BUDGET, GEOMETRY)
-"""Keys that others, such as sizes, follow from: what follows does not name a row."""
+"""Keys from which others, such as sizes, follow; keys that follow do not name a row."""
 SHARED_KEYS = (*CAUSE_KEYS, "dataset.near", "dataset.far", "loss.weight", "metrics.lpips_net")
-"""Keys that runs of all backbones may share; of the data's keys, those that change no test picture."""
+"""Keys that runs of all backbones may share; of ``dataset``'s keys only those that change no test picture."""
 UNNAMED_VALUES = {"color_space": "rgb", "loss": None, "appearance": "none"}
 """Values by key that do not name a row."""
 PAPER_KEYS = ("backbone", "ctm", *UNNAMED_VALUES, "backbone.encoding", "ctm.P", "ctm.k")
@@ -25,13 +25,13 @@ PAPER_KEYS = ("backbone", "ctm", *UNNAMED_VALUES, "backbone.encoding", "ctm.P", 
 
 
 class Found(NamedTuple):
-    """Runs below some folders."""
+    """The runs found below some folders, and those left out."""
 
     runs: list[Run]
     left_out: list[str]
-    """Folders of other runs, each with the reason: no scores yet, the error that a sweep saw, damaged, doubled."""
+    """Folders of runs left out, each with the reason: no scores yet, a sweep's error, damaged, a duplicate."""
     shared: list[str]
-    """Settings that all runs of a backbone on a scene share, and those on other scenes do not."""
+    """Settings that are alike in all runs of a backbone on one scene, but differ between scenes."""
 
 
 def find_runs(folders: Sequence[Path]) -> Found:
@@ -55,9 +55,9 @@ def find_runs(folders: Sequence[Path]) -> Found:
 
 
 def scenes_apart(runs: Sequence[Run]) -> list[Run]:
-    """Give scenes of one name, of which runs were scored on different pictures, names of their own.
+    """Rename scenes of one name whose runs were scored on different pictures, so that each has its own name.
 
-    By the data's settings that differ, such as ``lego (dataset.exposure=0.02)``; where none does, by the protocol or
+    Names have the data's settings that differ, ``lego (dataset.exposure=0.02)``; where none does, the protocol or
     the pictures' fingerprint. Random backgrounds are in the fingerprint, and patches differ from seed to seed.
     """
     note: dict[int, list[str]] = {id(run): [] for run in runs}
@@ -80,9 +80,9 @@ def scenes_apart(runs: Sequence[Run]) -> list[Run]:
 
 
 def set_apart(runs: Sequence[Run]) -> tuple[list[Run], list[str]]:
-    """Give each run's setting the keys in which runs of its backbone, or of its transform there, differ on a scene.
+    """Add to each run's setting the keys in which runs of its backbone, or of its transform with it, differ on a scene.
 
-    A key that only differs between scenes, such as ``backbone.coarse``, is in a note: rows are pooled over scenes.
+    A key that differs only between scenes, such as ``backbone.coarse``, becomes a note: rows are pooled over scenes.
     """
     more: dict[int, Setting] = {id(run): {} for run in runs}
     notes = set()
@@ -138,13 +138,13 @@ def _telling(runs: Sequence[Run], concerns: Callable[[str], bool], choices: Sequ
 
 
 def others(setting: Setting) -> Setting:
-    """Keys in which runs of a report differ besides those that the paper's tables vary."""
+    """The part of a setting besides the keys that the paper's tables vary."""
     zeros = {key for key, value in weights(setting).items() if value in (None, "0")}
     return {key: value for key, value in setting.items() if key not in (*PAPER_KEYS, *zeros)}
 
 
 def names(settings: Iterable[Setting]) -> dict[tuple, str]:
-    """Name settings by the keys in which they differ, such as ``ctm=quick ctm.P=2``, without what most have."""
+    """Name settings by the keys in which they differ, such as ``ctm=quick ctm.P=2``, without the most common values."""
     unique = list({tuple(setting.items()): setting for setting in settings}.values())
     counts, unsaid = _counts(unique), UNNAMED_VALUES | most_have(unique)
 
@@ -172,13 +172,13 @@ def _counts(settings: Iterable[Setting]) -> dict[str, Counter]:
 
 
 def differing(one: Setting, other: Setting) -> set[str]:
-    """Find keys that two settings both have and have differently; a backbone's and a transform's own follow from it."""
+    """Find keys whose values differ between two settings; keys below a choice that differs itself do not count."""
     keys = {key for key in one.keys() & other.keys() if one[key] != other[key]}
     return {key for key in keys if key.partition(".")[0] == key or key.partition(".")[0] not in keys}
 
 
 def grouped(runs: Iterable[Run], of: Callable[[Run], Hashable]) -> dict[Any, list[Run]]:
-    """Sort runs by something that they share."""
+    """Group runs by the value of a function of them."""
     groups: dict[Any, list[Run]] = defaultdict(list)
     for run in runs:
         groups[of(run)].append(run)

@@ -37,7 +37,7 @@ PICTURE_KINDS = ("lit", "dark", "latent", "depth", "warps", "patches", "fused")
 
 
 def page(tables: Sequence[Table], group: Found, home: Path) -> str:
-    """HTML that needs nothing else, with links from the folder ``home`` to runs' own pages; names are escaped."""
+    """The report as HTML that needs no other file, with links from the folder ``home`` to the runs' pages."""
     environment = Environment(loader=PackageLoader("ctm_plugin.report", "."), autoescape=True)
     return environment.get_template("page.html.jinja").render(
         tables=[written(table, "html") for table in tables],
@@ -50,20 +50,20 @@ def page(tables: Sequence[Table], group: Found, home: Path) -> str:
 
 
 def link(path: Path, home: Path) -> str:
-    """A file's address from a folder."""
+    """A file's relative URL from the folder ``home``."""
     return quote(os.path.relpath(path, home))
 
 
 def first_seeds(runs: Sequence[Run]) -> dict[str, list[Run]]:
-    """The runs of each scene, of each setting the first seed; without CTM first."""
+    """The runs of each scene, one a setting, of the first seed; those without CTM come first."""
     rows = by_scene(configurations(runs))
     return {scene: [min(members, key=lambda run: run.seed) for _, members in own] for scene, own in rows.items()}
 
 
 def scene_entry(scene: str, runs: Sequence[Run]) -> dict:
-    """Runs of a scene: the photograph and sliders between any two, the window where two differ most, curves.
+    """Content of a scene's entry: photograph, sliders between any two runs, the window where two differ most, curves.
 
-    First it shows plain RGB and ``ctm=auto``, or another transform where that is not there.
+    At first the sliders show plain RGB and ``ctm=auto``, or another transform where that is missing.
     """
     layers = {kind: of_kind for kind in PICTURE_KINDS if (of_kind := layers_of(kind, runs))}
     numbers = sorted({number for of_kind in layers.values() for number in of_kind})
@@ -116,7 +116,7 @@ def embedded(content: np.ndarray | bytes) -> str:
 
 
 class Curve(NamedTuple):
-    """PSNR in the course of a training."""
+    """PSNR in the course of a training, over steps and time."""
 
     steps: list[int]
     minutes: list[float]
@@ -148,7 +148,7 @@ def curves_of(run: Path) -> dict[str, Curve]:
     """The curves of :data:`CURVES` that TensorBoard has of a run, of two points and more.
 
     Raises:
-        CheckpointError: its files are damaged.
+        CheckpointError: TensorBoard's files are damaged.
     """
     folder = run / "tensorboard"
     if not folder.is_dir():

@@ -1,4 +1,4 @@
-"""Pictures that runs have written, for reports and figures."""
+"""Choice of runs' pictures to compare, for reports and figures."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ CROP_DIVISOR = 4
 
 
 def pictures(run: Run) -> dict[str, Path]:
-    """What there is of a run, by kind: of a scene of the middle test view; ``photo`` is what ``lit`` should be."""
+    """A run's picture files by kind, of the middle test view; ``photo`` is the target of ``lit``."""
     rows = run.metrics.get("per_image") or []
     if rows:
         name = rows[len(rows) // 2]["name"]
@@ -31,7 +31,7 @@ def picture(run: Run, kind: str) -> np.ndarray:
     """One of a run's pictures, ``[H, W, 3]`` bytes.
 
     Raises:
-        CTMError: it is missing, or no picture.
+        CTMError: the file is missing, or no picture.
     """
     path = pictures(run).get(kind)
     if path is None:
@@ -40,9 +40,9 @@ def picture(run: Run, kind: str) -> np.ndarray:
 
 
 def pairs(runs: Sequence[Run]) -> list[tuple[Run, Run]]:
-    """For each scene, backbone and appearance a run without CTM and one with it, which differ in no more than that.
+    """For each scene, backbone and appearance, a run without CTM and one with it that differ in nothing else.
 
-    The first seed that both have; CTM as its preset has it, all terms and the paper's sizes, where there is a choice.
+    Of several, the first common seed, and the CTM closest to its preset, with all terms and the paper's sizes.
     """
     pairs_by_key: dict[tuple, tuple[Run, Run]] = {}
     for on in sorted((run for run in runs if run.setting["ctm"] != "off"), key=_distance):
@@ -55,7 +55,7 @@ def pairs(runs: Sequence[Run]) -> list[tuple[Run, Run]]:
 
 
 def _distance(run: Run) -> tuple[int, bool, bool, int]:
-    """How far a run with CTM is from its preset, and its seed."""
+    """Sort key of a run with CTM: its differences from the preset, then its seed."""
     zeros = list(weights(run.setting).values()).count("0")
     return zeros, run.setting.get("ctm.P") != "4", run.setting.get("ctm.k") != "3", run.seed
 

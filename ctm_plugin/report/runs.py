@@ -1,4 +1,4 @@
-"""Finished runs below some folders, and why others are left out."""
+"""Reading of finished runs below folders, with the reasons why others are left out."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from ctm_plugin.settings.setting import is_number
 MAX_ERROR = 10_000
 """Most characters of a failed run's error that are shown."""
 MAX_SCORE = 1e9
-"""Number that no score reaches."""
+"""Bound on scores: larger numbers count as missing."""
 LOSS_TERMS = ("enc", "dec", "img", "rand", "latent")
-"""Terms of the transform's loss."""
+"""Names of the terms of CTM's loss."""
 CHOICE_KEYS = {"backbone": "name", "ctm": "name", "color_space": "name", "loss": "kind", "appearance": "name"}
 """Sections of a configuration and their key that names the choice."""
 LOCATION_KEYS = {
@@ -27,9 +27,9 @@ LOCATION_KEYS = {
     "ctm.k",
     *(f"dataset.{key}" for key in ("root", "image", "seed", "scene")),
 }
-"""Keys that say where the data lie, and keys that belong to the setting."""
+"""Keys left out of a run's ``rest``: places of the data, and keys that its ``setting`` has already."""
 Setting = dict[str, str | None]
-"""Keys of a command line and their values; ``None`` is the preset's own value."""
+"""A run's setting: keys of a command line and their values; ``None``: the preset's value."""
 
 
 @dataclass(frozen=True)
@@ -37,11 +37,11 @@ class Run:
     """A finished run.
 
     Attributes:
-        folder: where it is.
-        config, metrics: what its files say.
-        setting: what the paper's tables vary, and with :func:`~ctm_plugin.report.labels.find_runs` all other keys in
-            which runs of one report differ.
-        rest: all other settings that its scores depend on, as text by dotted key.
+        folder: the run's directory.
+        config, metrics: contents of ``config.yaml`` and ``metrics.json``.
+        setting: values of keys that the paper's tables vary; after :func:`~ctm_plugin.report.labels.find_runs` also
+            of all other keys in which runs of one report differ.
+        rest: all other settings that the run's scores depend on, as text by dotted key.
         label: the setting's name among other runs.
     """
 
@@ -62,7 +62,7 @@ class Run:
 
     @property
     def key(self) -> tuple:
-        """The setting, to group by."""
+        """The setting as a hashable tuple, to group runs by."""
         return tuple(self.setting.items())
 
     @property
@@ -70,7 +70,7 @@ class Run:
         return self.metrics.get("converged") is not False
 
     def value(self, metric: str) -> float | None:
-        """A score; ``None`` where it is none, NaN included, or so large that means would overflow."""
+        """A metric's value; ``None`` where it is missing, NaN, or so large that means would overflow."""
         value = self.metrics.get(metric)
         return float(value) if is_number(value) and abs(value) < MAX_SCORE else None
 
@@ -107,10 +107,10 @@ def _run_or_reason(folder: Path) -> Run | str:
 
 
 def read_run(folder: Path) -> Run:
-    """Read one finished run; nothing in its files is interpreted.
+    """Read one finished run; nothing in its files is executed.
 
     Raises:
-        CheckpointError: a file cannot be read, or says too little.
+        CheckpointError: a file cannot be read, or lacks a value.
     """
     config, metrics = read_yaml(folder / CONFIG), read_json(folder / METRICS)
     if missing := [key for key in ("protocol", "dataset", "steps") if key not in metrics]:
@@ -142,7 +142,7 @@ def _check_metrics(metrics: Mapping[str, Any]) -> None:
 
 
 def _setting(config: Mapping[str, Any], aligned: bool) -> Setting:
-    """What a table may vary, of the configuration of a run of views, or of patches that were ``aligned``."""
+    """Read a run's setting, the keys that the paper's tables vary; ``aligned``: it is a run of aligned patches."""
     ctm, space, loss = config["ctm"], dict(config["color_space"]), config["loss"]["kind"]
     setting: Setting = {
         "backbone": config["backbone"]["name"],
@@ -162,7 +162,7 @@ def _setting(config: Mapping[str, Any], aligned: bool) -> Setting:
 
 
 def preset_of(config: Mapping[str, Any]) -> str:
-    """The transform as people choose it, ``off`` for none."""
+    """Name of the transform's choice of ``ctm``, ``off`` for none."""
     name = config["ctm"]["name"]
     preset = "off" if name == "none" else config["ctm"].get("preset", name)
     _check("ctm.preset", preset, isinstance(preset, str))
@@ -170,7 +170,7 @@ def preset_of(config: Mapping[str, Any]) -> str:
 
 
 def _rest(config: Mapping[str, Any]) -> dict[str, str]:
-    """Everything else that scores depend on: without seeds, paths, and how often something is logged."""
+    """All other settings that scores depend on, by dotted key: without seeds, paths and logging intervals."""
     values = dict(leaves({section: config[section] for section in ("backbone", "ctm", "appearance", "dataset")}))
     for section, keys in {
         "dataset": ("geometry", "near", "far", "background_level"),
@@ -184,12 +184,12 @@ def _rest(config: Mapping[str, Any]) -> dict[str, str]:
 
 
 def _as_typed(value: Any) -> str:
-    """A value as people type it: 1 and 1.0 are the same."""
+    """Text of a value as on a command line; 1 and 1.0 are the same."""
     if value is None or isinstance(value, bool):
         return "null" if value is None else str(value).lower()
     return str(int(value)) if is_number(value) and value == value // 1 else str(value)
 
 
 def weights(keys: Mapping[str, Any]) -> dict[str, Any]:
-    """Those of CTM's loss terms."""
+    """Weights of CTM's loss terms, out of the keys of ``ctm``."""
     return {key: value for key, value in keys.items() if key.startswith("ctm.weights.")}

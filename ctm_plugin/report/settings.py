@@ -10,7 +10,7 @@ from ctm_plugin.settings.setting import Settings, setting
 
 @dataclass(frozen=True, kw_only=True)
 class ReportConfig(Settings):
-    """What to tell of the runs, and how."""
+    """Settings of ``ctm report``: metrics, tables and formats."""
 
     table: int | None = setting(
         None, "number of the paper's table to show, 1 to 19; null: all runs, and the paper's tables that they fill"

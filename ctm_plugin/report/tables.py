@@ -27,15 +27,15 @@ PAPER: dict[int, dict[str, Any]] = {int(number): DATA["methods"] | table for num
 LIT_TABLE = DATA["lit"]
 """Published scores of lit views."""
 NO_CTM = {"ctm": "off"} | UNNAMED_VALUES
-"""Values of the row that others are compared with, where there are such runs."""
+"""Setting of the row that others are compared with, where it has runs: plain RGB without CTM."""
 Named = Iterator[tuple[str, list[Run]]]
 
 
 def choose(group: Found, number: int | None, data: str | None) -> list[Table]:
-    """The table that was asked for; else all runs, lit views where there are references, and tables of the paper.
+    """Make the paper's table of a ``number``; else tables of all runs, of lit views, and of the paper.
 
-    These are of runs of the paper's data sets, each of those of Tables 1 to 7 that show most: a table of which one
-    setting has runs is left out, and one whose settings all stand in another.
+    Of the paper's Tables 1 to 7 those with runs on the paper's data sets are made. A table is left out if only one of
+    its settings has runs, or if another table has all of its settings.
     """
     if data is not None or number is not None:
         return [paper_table(number or 1, data, group.runs)]
@@ -58,9 +58,9 @@ def choose(group: Found, number: int | None, data: str | None) -> list[Table]:
 def all_runs(group: Found) -> Table:
     """A row for each setting on each scene, and on the mean over a backbone's scenes.
 
-    Below, differences of the same scene and seed between settings that differ in one key. Where closed forms were
-    swept, also from the one that scores best on that scene, for each metric its own: chosen by the very scores that are
-    compared, which no single closed form can be above.
+    Below, paired differences between settings that differ in one key. Where closed forms were swept, also the
+    difference from the closed form that scores best on each scene, for each metric its own. It is chosen by the
+    scores that are compared, so that no single closed form can be above it.
     """
     runs, rows = group.runs, configurations(group.runs)
     columns = columns_of((name for name in told_at("report") if any(run.value(name) is not None for run in runs)), runs)
@@ -79,7 +79,7 @@ def all_runs(group: Found) -> Table:
 
 
 def configurations(runs: Sequence[Run]) -> Rows:
-    """Runs of each setting, by label; RGB without CTM first, numbers by their size."""
+    """Rows of a table: the runs of each setting, by label; RGB without CTM first, numbers in ascending order."""
 
     def order(runs: list[Run]) -> list[tuple]:
         keys = runs[0].setting
@@ -98,7 +98,7 @@ def _sortable(value: Any) -> tuple[float, str]:
 
 
 def by_scene(rows: Rows) -> dict[str, Rows]:
-    """The rows of each scene."""
+    """Split rows by scene: the rows of each scene, with only its runs."""
     groups: dict[str, Rows] = {}
     for label, members in rows:
         for scene, own in grouped(members, lambda run: run.scene).items():
@@ -107,7 +107,7 @@ def by_scene(rows: Rows) -> dict[str, Rows]:
 
 
 def blocks_of(rows: Rows) -> list[tuple[str, Rows]]:
-    """Rows of each scene, and for each backbone with several scenes those that have all, for the mean over them."""
+    """Blocks of a table: rows of each scene; for each backbone with several scenes, the means of rows that have all."""
     blocks = list(by_scene(rows).items())
     for backbone in sorted({members[0].setting["backbone"] for _, members in rows}):
         own = [row for row in rows if row[1][0].setting["backbone"] == backbone]
@@ -119,10 +119,10 @@ def blocks_of(rows: Rows) -> list[tuple[str, Rows]]:
 
 
 def _compared(rows: Rows, closed: bool, runs: list[Run], column: Column) -> Named:
-    """The rows that a row's runs are compared with: those that differ in one key and have there its reference value.
+    """Reference rows of a row's runs: rows that differ from it in one key and have that key's reference value.
 
-    Without CTM, RGB and the like; of other keys the value that most rows have, of several the first. Besides, the best
-    ``closed`` form; on a scene of its own that is one of the rows.
+    That is no CTM, RGB and the like; of other keys the commonest value, the first of several. With ``closed``, also the
+    best closed form; on a single scene that is one of the rows.
     """
     if not METRICS[column.metric].of:
         return
@@ -140,7 +140,7 @@ def _compared(rows: Rows, closed: bool, runs: list[Run], column: Column) -> Name
 
 
 def _best_closed_form(rows: Rows, setting: Setting, column: Column) -> tuple[str, list[Run]]:
-    """Choose for each scene the runs of the fixed space that is best in a column; of those that most seeds have."""
+    """Choose for each scene the runs of the fixed colour space that is best in a column, among those of most seeds."""
     forms = [
         run
         for _, members in rows
@@ -176,7 +176,7 @@ def lit_views(runs: Sequence[Run]) -> Table:
     )
 
     def of(which: str, runs: Sequence[Run]) -> list[Cell]:
-        """The same scores of other pictures, such as ``psnr_lit_photo``; there are none of other columns."""
+        """Cells of the columns' metrics with the suffix ``which``, as ``psnr_lit_photo``; empty for other metrics."""
         metrics = [column.metric + which if column.metric in LIT_TABLE["metrics"] else "" for column in columns]
         return [cell_of(runs, replace(each, metric=metric)) for each, metric in zip(columns, metrics, strict=True)]
 
@@ -203,12 +203,12 @@ def lit_views(runs: Sequence[Run]) -> Table:
 
 
 def paper_table(number: int, data: str | None, runs: Sequence[Run]) -> Table:
-    """A table of the paper out of those runs that belong in it, with the paper's values of a data set.
+    """Make a table of the paper out of the runs that belong in it, with the paper's values for a data set.
 
-    Without ``data`` of the one that the runs are of, and no values where the table has none of it.
+    Without ``data``, the runs' data set is taken; a table without values for it has none.
 
     Raises:
-        CTMError: there is no such table, it has no values of that data, or no run belongs in it.
+        CTMError: there is no such table, it has no values for that data set, or no run belongs in it.
     """
     if number not in PAPER:
         raise CTMError(f"table: found {number}, expected one of {', '.join(map(str, PAPER))}")
@@ -237,12 +237,12 @@ def paper_table(number: int, data: str | None, runs: Sequence[Run]) -> Table:
 
 
 def datasets(number: int) -> list[str]:
-    """The data sets that the values of a table are of; Table 1 has four."""
+    """Data sets that a table of the paper has values for; Table 1 has four."""
     return [name.partition(",")[0] for name in PAPER[number]["values"]]
 
 
 def data_of(run: Run) -> str | None:
-    """The paper's data set that a run is of, by its layout and its scene's name; ``None``: of none."""
+    """Find the paper's data set that a run was trained on, by layout and scene name; ``None``: another data set."""
     dataset = run.config["dataset"]
     for name, layout in DATA["layouts"].items():
         scenes = next(each["values"][name]["DVGO"] for n, each in PAPER.items() if n > 7 and name in each["values"])
@@ -255,12 +255,12 @@ def data_of(run: Run) -> str | None:
 
 
 def _scene_in(scene: str, known: Collection[str]) -> str | None:
-    """The paper's name in a scene's: ``lego`` in ``lego_400``; the longest one."""
+    """Find the paper's scene name in a run's: ``lego`` in ``lego_400``; of several the longest."""
     return max((name for name in known if name in scene.lower()), key=len, default=None)
 
 
 def fits(setting: Setting, row: Mapping[str, str]) -> bool:
-    """Whether a setting belongs in a row of the paper: all that the row does not name is the paper's own choice."""
+    """Whether a setting belongs in a row of the paper: keys that the row does not name have the paper's values."""
     learned = row.get("ctm") != "off"
     wanted = DATA["usual"] | (DATA["learned"] if learned else {}) | row
     return (
@@ -271,7 +271,7 @@ def fits(setting: Setting, row: Mapping[str, str]) -> bool:
 
 
 def by_row(table: Mapping[str, Any], runs: Sequence[Run]) -> list[tuple[str, str, list[Run]]]:
-    """The rows that have runs: name, label, runs; a row for each backbone, preset and what else sets runs apart."""
+    """Rows of a paper's table that have runs, as (name, label, runs); one for each backbone, preset and other key."""
     kinds: dict[tuple, list[Run]] = {}
     for index, (name, row) in enumerate(table["rows"].items()):
         for run in runs:
@@ -289,7 +289,7 @@ def by_row(table: Mapping[str, Any], runs: Sequence[Run]) -> list[tuple[str, str
 
 
 def _references(number: int, rows: Sequence[tuple[str, str, list[Run]]], runs: list[Run], column: Column) -> Named:
-    """The row that another one is compared with: of its backbone and preset, without CTM, or the table's reference."""
+    """Reference row of a paper's row: the same backbone and preset without CTM, or the table's reference."""
     if column.scene:
         return
     table, setting = PAPER[number], runs[0].setting
@@ -311,7 +311,7 @@ def _references(number: int, rows: Sequence[tuple[str, str, list[Run]]], runs: l
 
 
 def _paper_value(values: Any, metrics: Sequence[str], column: Column, runs: Sequence[Run]) -> float | None:
-    """The paper's value; of a table of scenes, that of the scene, or the mean over the scenes that are here."""
+    """The paper's value of a row in a column; in a table by scene, the scene's, or the mean over the runs' scenes."""
     if isinstance(values, str):  # N.C.
         return math.nan
     if isinstance(values, list):
@@ -325,7 +325,7 @@ def _paper_value(values: Any, metrics: Sequence[str], column: Column, runs: Sequ
 
 
 def notes_of(runs: Sequence[Run]) -> list[str]:
-    """How runs were scored and trained, and where their scores are none."""
+    """Notes under a table: how runs were scored and trained, and which scores are missing."""
     notes = [f"Protocol: {protocol}." for protocol in sorted({run.metrics["protocol"] for run in runs})]
     budgets = sorted({f"{run.setting['backbone']} {run.metrics['steps']} steps" for run in runs})
     # Runs of old versions do not say whether they were.

@@ -1,4 +1,4 @@
-"""Tables as Markdown, CSV, LaTeX and HTML; what a cell says is one for all formats."""
+"""Tables as text in Markdown, CSV, LaTeX and HTML, with the same cells in all formats."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ PAIRED = (
 RANK_MARKS = {"md": ("**{}**", "_{}_"), "latex": (r"\textbf{{{}}}", r"\underline{{{}}}"), "html": ("{} ●", "{} ○")}
 """Templates that mark the best and the second best of a column by format."""
 RANK_LEGENDS = {"md": ("**Best**", "_second best_"), "html": ("● best", "○ second best")}
-"""Words that explain these marks by format."""
+"""Legends that explain the marks of ranks by format."""
 
 
 class Written(NamedTuple):
-    """A table as text: grids, a list of lines with the headings first, and what stands above and below them."""
+    """A table as text: its grids, each a list of lines with the headings first, and the text above and below."""
 
     title: str
     above: list[str]
@@ -38,12 +38,12 @@ class Written(NamedTuple):
 
 
 def spread(mean: float, std: float | None, decimals: int, sign: str = "") -> str:
-    """``mean ± std``, or ``mean`` of one."""
+    """Format ``mean ± std``, or only the mean where there is no deviation."""
     return f"{mean:{sign}.{decimals}f}" + ("" if std is None else f" ± {std:.{decimals}f}")
 
 
 def written(table: Table, form: str) -> Written:
-    """A table as text for a format of :data:`RANK_MARKS`."""
+    """Write a table's cells as text for a format of :data:`RANK_MARKS`."""
     lines = [_headings(table), *(_line(table, *row, ("{}", *RANK_MARKS[form])) for row in table.rows)]
     about = ABOUT.format(*RANK_LEGENDS.get(form, RANK_LEGENDS["md"])) + (
         PAPERS.format(data=table.data) if table.data else ""
@@ -75,7 +75,7 @@ def _line(table: Table, label: str, cells: Sequence[Cell], marks: Sequence[str])
 
 
 def _ours(cell: Cell, decimals: int) -> str:
-    """``mean ± std (seeds)``, with what did not converge."""
+    """Format a cell as ``mean ± std (seeds)``, with the number of runs that did not converge."""
     if cell.mean is None:
         return "N.C." if cell.not_converged else "-"
     text = spread(cell.mean, cell.std, decimals)
@@ -85,7 +85,7 @@ def _ours(cell: Cell, decimals: int) -> str:
 
 
 def _differences(table: Table) -> list[list[str]]:
-    """Headings, and a line for each two rows with their paired differences; empty where there is none."""
+    """Grid of paired differences: headings, and a line for each two rows compared; empty where there are none."""
     texts_by_row: dict[str, dict[Column, str]] = {}
     for label, cells in table.rows:
         for cell, column in zip(cells, table.columns, strict=True):
@@ -98,7 +98,7 @@ def _differences(table: Table) -> list[list[str]]:
 
 
 def _paired(difference: Difference, decimals: int) -> str:
-    """``mean ± half (pairs)``, and what it says."""
+    """Format a difference as ``mean ± half (pairs)``, with a word on whether it is an improvement."""
     pairs = "" if difference.half is None else f" ({difference.pairs})"
     verdict = {True: " better", False: " worse", None: ""}[difference.better]
     return spread(difference.mean, difference.half, decimals, "+") + pairs + verdict
@@ -120,8 +120,8 @@ def markdown(table: Table) -> str:
 
 
 def csv_text(tables: Sequence[Table]) -> str:
-    """One line a row and column, or as many as the row is compared with others; numbers unrounded; empty where there is
-    none, ``N.C.`` where nothing converged.
+    """Tables as CSV: a line for each row, column and comparison; numbers unrounded; empty where there is none,
+    ``N.C.`` where nothing converged.
     """
     out = io.StringIO()
     scores = ("mean", "std", "seeds", "scenes", "runs", "not_converged", "paper", "difference")
@@ -141,7 +141,7 @@ def csv_text(tables: Sequence[Table]) -> str:
 
 
 def latex(table: Table) -> str:
-    """A ``booktabs`` table."""
+    """Write a table as LaTeX, in ``booktabs`` style."""
     text, heads = written(table, "latex"), ["ours", "paper", "diff."] if table.data else ["ours"]
     groups = " & ".join(
         rf"\multicolumn{{{len(heads)}}}{{c}}{{{_escaped(f'{each.label} {METRICS[each.metric].arrow}')}}}"
@@ -160,7 +160,7 @@ def latex(table: Table) -> str:
 
 
 def _escaped(text: str) -> str:
-    """For LaTeX, whose marks are kept."""
+    """Escape text for LaTeX; the marks of ranks, which are LaTeX, are kept."""
     text = re.sub(r"([&%#_])", r"\\\1", text).replace("±", r"$\pm$")
     return text.replace("↑", r"$\uparrow$").replace("↓", r"$\downarrow$")
 
@@ -170,4 +170,4 @@ FORMATS = {
     "csv": csv_text,
     "latex": lambda tables: "\n".join(map(latex, tables)),
 }
-"""Function that writes tables as text by format."""
+"""Functions that write tables as text, by format."""

@@ -1,1 +1,1 @@
-"""A run: put together, trained, scored, read again."""
+"""Runs: assembled from a configuration, trained, scored, read again from their folders."""

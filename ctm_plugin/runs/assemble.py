@@ -46,8 +46,8 @@ def assemble(
         config: the resolved configuration.
         run: the directory of a run that is to be trained, from ``step`` on. Loggers and callbacks are only built for
             it: scoring does not need their packages.
-        scene: takes the place of the configuration's, whose data are gone.
-        capture: of the configuration's data, where they have been read.
+        scene: scene to use in place of the configuration's, whose data are gone.
+        capture: the capture of the configuration's data, where it has been read already.
 
     Raises:
         CTMError: on anything that cannot be used, naming the key or the file.
@@ -81,7 +81,7 @@ def assemble(
 
 
 def _made_for(scene: Any) -> Iterator[str]:
-    """Find the backbones that train on a scene, but for other packages' that cannot be imported."""
+    """Find the names of backbones that train on a scene; other packages' that cannot be imported are skipped."""
     for name in BACKBONES.names():
         with suppress(CTMError):
             if isinstance(scene, BACKBONES.get(name).Scene):
@@ -89,10 +89,10 @@ def _made_for(scene: Any) -> Iterator[str]:
 
 
 def loggers(config: Config, run: Path, step: int) -> list[RunLogger]:
-    """Build what a run's curves and pictures go to; ``step`` is what it goes on from.
+    """Build a run's loggers; ``step`` is the step that the run resumes from.
 
     Raises:
-        CTMError: on settings that cannot be used, or where its package is missing.
+        CTMError: on settings that cannot be used, or where a logger's package is missing.
     """
     name = name_of(config["logger"])
     settings = section_of(config, "logger")
@@ -106,13 +106,13 @@ def loggers(config: Config, run: Path, step: int) -> list[RunLogger]:
 
 
 def load_scene(config: Config, capture: Capture | None = None) -> Any:
-    """Load the data set that a configuration names, whose ``capture`` may have been read."""
+    """Load the data set that a configuration names; its ``capture`` is given where it has been read already."""
     dataset = made(DATASETS.get(name_of(config["dataset"])), section_of(config, "dataset"))
     return dataset.load() if capture is None else dataset.load(capture)
 
 
 def color_transform(config: Config, seed: int) -> ColorTransform:
-    """Build the fixed space with the learned transform on top of it, which knows how it is trained."""
+    """Build the fixed colour space with the learned transform on top, and its training settings as ``learning``."""
     name = name_of(config["color_space"])
     with seeded(seed):
         space = COLOR_SPACES.get(name)(section_of(config, "color_space"))

@@ -1,4 +1,4 @@
-"""A scene as its run keeps it, without its pictures: enough to render, where the data are gone."""
+"""A run's note of its scene without pictures, which is enough to render when the data are gone."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ from ctm_plugin.scene.poses import Similarity
 from ctm_plugin.scene.views import Scene, Views
 
 CAMERAS_FILE = "cameras.json"
-"""Name of a run's file of training and test cameras, with all of its scene that is not a picture."""
+"""Name of a run's file of training and test cameras, bounds and light: all of its scene but the pictures."""
 COPIED = ("name", "near", "far", "geometry", "background")
-"""Attributes of a scene that the file holds unchanged."""
+"""Attributes of a scene that the file of cameras holds unchanged."""
 
 
 def note_cameras(run: Path, module: PosedBackbone) -> None:
-    """Write down how a run's scene is looked at: cameras, bounds, background, masks and light, but no picture."""
+    """Write the file of cameras of a run's scene: cameras, bounds, background, masks and light, but no picture."""
     scene, world = module.scene, module.scene.world
     note = {
         **{name: getattr(scene, name) for name in COPIED},
@@ -59,10 +59,10 @@ def _note(views: Views) -> dict[str, Any]:
 
 
 def noted_scene(run: Path) -> Scene | None:
-    """The scene of a run without its pictures, which are one level everywhere; ``None``: it is not written down.
+    """Read a run's scene out of its file of cameras, with pictures of one grey level; ``None``: there is no file.
 
     Raises:
-        CheckpointError: what is written down cannot be used.
+        CheckpointError: the file cannot be used.
     """
     if not (run / CAMERAS_FILE).is_file():
         return None

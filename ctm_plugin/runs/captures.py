@@ -1,4 +1,4 @@
-"""A scene as a folder that other programs train on: pictures, masks, ``transforms.json`` and COLMAP's model."""
+"""Export of a scene as a folder that other programs train on: pictures, masks, ``transforms.json``, COLMAP's model."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ from ctm_plugin.show.bars import tracked
 from ctm_plugin.show.ply import write_ply
 
 POINTS_FILE = "sparse_pc.ply"
-"""File of the points once more, by nerfstudio's name: it does not look for COLMAP's."""
+"""Name of a second file of the points, for nerfstudio, which does not read COLMAP's."""
 
 
 class Dots(NamedTuple):
-    """Points in the files' world: positions and normals ``[P, 3]``, and sRGB ``[P, 3]`` of 8 bits."""
+    """A cloud of points in the files' world: positions and normals ``[P, 3]``, and sRGB ``[P, 3]`` of 8 bits."""
 
     positions: Float[np.ndarray, "p 3"]
     normals: Float[np.ndarray, "p 3"]
@@ -49,11 +49,11 @@ class CapturedView(NamedTuple):
     """A view in COLMAP's or nerfstudio's list.
 
     Attributes:
-        file: of its picture, in the folder ``images``.
-        testing: whether it is for testing.
+        file: name of the view's picture in the folder ``images``.
+        testing: whether it is a test view.
         lens: intrinsics and distortion.
         pose: camera to world, in the files' world.
-        sight: what it sees of the points.
+        sight: the points that the view observes.
     """
 
     file: str
@@ -137,7 +137,7 @@ def write_sparse(folder: Path, shots: Sequence[CapturedView], dots: Dots) -> Non
 
 
 def bounds_of(scene: Scene) -> dict[str, float]:
-    """Near and far in the files' world."""
+    """Near and far of a scene, in units of the files' world."""
     size = (scene.world or IDENTITY).scale
     near = scene.near if scene.world is None else 1 / (NEAR_TARGET * size)  # what becomes NDC's near plane
     return {"near": near, "far": scene.far / size}
@@ -150,7 +150,7 @@ def lens_of(views: Views, index: int) -> Intrinsics:
 
 
 def frame_of(shot: CapturedView, masked: bool) -> dict[str, Any]:
-    """A view's entry among the frames."""
+    """A view's entry among the frames of ``transforms.json``."""
     lens, name = shot.lens, Path(shot.file).stem
     numbers = dict(zip(("fl_x", "fl_y", "cx", "cy"), lens.pinhole, strict=True))
     if lens.distortion != PINHOLE:
@@ -173,7 +173,7 @@ def seen(points: Points, views: Views, index: int, image: Pixels) -> Sights:
 def coloured(scene: Scene, shots: Sequence[CapturedView]) -> tuple[Dots, list[CapturedView]]:
     """The reconstruction's points that views see, in the mean of their colours, and the sights of these.
 
-    Their normals are 0: nobody tells them.
+    The normals are 0, as they are unknown.
     """
     count = 0 if scene.points is None else len(scene.points.positions)
     rows, _, colors = (np.concatenate(part) for part in zip(*(each.sight for each in shots), strict=True))
@@ -189,7 +189,7 @@ def coloured(scene: Scene, shots: Sequence[CapturedView]) -> tuple[Dots, list[Ca
 
 
 def write_pixels(path: Path, image: Tensor) -> None:
-    """Write ``[H, W, C]`` of 8 bits as PNG, floats as TIFF of 16 bits."""
+    """Write a picture ``[H, W, C]``: 8 bits as PNG, floats as TIFF of 16 bits."""
     with replacing(path) as beside:
         if image.dtype == torch.uint8:
             iio.imwrite(beside, image.squeeze(-1).numpy(), extension=".png")

@@ -15,7 +15,7 @@ T = TypeVar("T")
 
 
 class Checked(NamedTuple):
-    """What a configuration's sections hold, as dataclasses; ``training``: what all of ``ctm`` share."""
+    """A configuration's sections as checked dataclasses; ``training``: settings that all choices of ``ctm`` share."""
 
     dataset: Any
     backbone: Any
@@ -83,7 +83,7 @@ def transform_of(config: Config) -> tuple[Any, Any]:
 
 
 def kind_of(section: str, name: str) -> type:
-    """Find the dataclass of a section's settings, under the name of a choice where it has several."""
+    """Find the dataclass of a section's settings, by the choice's name where each choice has its own."""
     if section in PRESET_SETTINGS:
         return load(PRESET_SETTINGS[section])
     return Nothing if name == "none" else REGISTRIES[section].settings(name)
@@ -94,12 +94,12 @@ def name_of(node: Config) -> str:
 
 
 def own(node: Config) -> dict[str, Any]:
-    """A group's own settings: without the name it is registered under and the preset it came from."""
+    """The settings in a group's node: without ``name``, which it is registered under, and ``preset``."""
     return {key: value for key, value in node.items() if key not in ("name", "preset")}
 
 
 def made(kind: type[T], settings: Any) -> T:
-    """Make an object of a class that has just these settings as its fields."""
+    """Make an instance of a dataclass out of another one's fields, which have the same names."""
     if isinstance(settings, kind):
         return settings
     return kind(**{each.name: getattr(settings, each.name) for each in fields(settings)})

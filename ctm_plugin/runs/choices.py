@@ -1,4 +1,4 @@
-"""What is registered, and what the files in ``conf/`` start from, as choices for Hydra out of their dataclasses."""
+"""Hydra's choices out of dataclasses: each registered name, and the defaults that the files in ``conf/`` start from."""
 
 from __future__ import annotations
 
@@ -45,12 +45,12 @@ def normalise(arguments: Sequence[str]) -> list[str]:
 
 
 def node(group: str, name: str = "") -> dict[str, Any]:
-    """Lay out what a YAML file with all keys of a group would hold; of callbacks without a name, of all of ours."""
+    """Lay out the YAML of a group's choice with all keys and defaults; without a name, of the whole group."""
     return _each(group, name, defaults)
 
 
 def told(group: str, name: str = "") -> dict[str, str]:
-    """Tell what the keys of a group mean, by dotted name."""
+    """The meanings of a group's keys, by dotted name."""
     return _each(group, name, meanings)
 
 
@@ -65,14 +65,14 @@ def _each(group: str, name: str, what: Callable[[type], dict[str, Any]]) -> dict
 
 
 def register(chosen: Iterable[str] | None = None) -> None:
-    """Tell Hydra of all choices that are no files: each registered name, and ``settings`` for the files to start from.
+    """Store in Hydra all choices that are no files: each registered name, and ``settings``, the files' defaults.
 
     Names of this package, of others and of the running program come the same way; a name that has gone from its
     registry is no choice any more.
 
     Args:
-        chosen: a command line. Of other packages, which may take long to import, what it does not name has no keys
-            yet; ``None``: all have.
+        chosen: a command line. Names of other packages that it does not contain are stored without keys, as their
+            import may take long; ``None``: all are imported.
     """
     words = None if chosen is None else set(re.findall(r"\w+", " ".join(chosen)))
     for group in (*PRESET_SETTINGS, "callbacks"):
@@ -100,10 +100,10 @@ def register(chosen: Iterable[str] | None = None) -> None:
 
 
 def with_usual_backbone(arguments: Sequence[str]) -> list[str]:
-    """Choose the backbone that a data set says is its own, ``default_backbone``, where neither a backbone nor an
-    experiment is named.
+    """Add the data set's ``default_backbone`` to a command line that names neither a backbone nor an
+    experiment.
 
-    Hydra's defaults could not: of two groups only the later one may say what the other is, and that is a backbone,
+    Hydra's defaults list cannot: of two groups only the later may choose the other, and the backbone already chooses
     by its ``default_dataset``.
     """
     arguments_left = []
@@ -122,10 +122,10 @@ def with_usual_backbone(arguments: Sequence[str]) -> list[str]:
 
 
 def with_fitting_dataset(arguments: Sequence[str]) -> list[str]:
-    """Choose the data set that reads ``dataset.root``, where neither a data set nor an experiment is named.
+    """Add the data set that reads ``dataset.root`` to a command line that names neither a data set nor an experiment.
 
     Raises:
-        DataError: none reads it.
+        DataError: no data set reads the folder.
         ConfigError: a sweep's folders are of several layouts.
     """
     given = {key.lstrip("+"): value for key, _, value in (argument.partition("=") for argument in arguments)}
@@ -151,7 +151,7 @@ _STORED: dict[tuple[str, str], dict[str, Any]] = {}
 
 
 def _store(group: str, name: str, choice: dict[str, Any]) -> None:
-    """Give Hydra's store a choice, unless it has just this one: every run of a sweep asks again."""
+    """Put a choice into Hydra's store, unless it is there already: every run of a sweep asks again."""
     store = ConfigStore.instance()
     if f"{name}.yaml" not in store.repo.get(group, {}) or _STORED.get((group, name)) != choice:
         store.store(group=group, name=name, node=choice)

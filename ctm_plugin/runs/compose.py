@@ -1,4 +1,4 @@
-"""From group choices and keys to a run's configuration, by Hydra."""
+"""Composition of a run's configuration out of group choices and keys, by Hydra."""
 
 from __future__ import annotations
 
@@ -28,22 +28,22 @@ from ctm_plugin.settings.setting import keys
 ROOT_KEYS = (*SECTIONS, "resume", "seed", "sweep", "hydra")
 """Keys at the top of a configuration."""
 FOLDER_FLAGS = ("-cd", "-cp", "-cn", "--config-", "hydra.searchpath")
-"""Beginnings of arguments that have Hydra look for choices in other folders too."""
+"""Prefixes of arguments that make Hydra search other folders for choices too."""
 DISK_FULL = ("no room on the disk", "some: make it, then try again; a run goes on by resume=RUN_DIR")
 NO_PERMISSION = (
     "no permission",
     "a place to start in where this user may read and write: hydra.run.dir=FOLDER moves a run, out=PATH a verb's files",
 )
 DISK_ERRORS = dict.fromkeys((errno.ENOSPC, errno.EDQUOT, errno.EFBIG), DISK_FULL)
-"""What was found and what is expected by the errno of a failed start."""
+"""Pairs of found and expected, for the message of a start that failed on a full disk, by errno."""
 DISK_ERRORS |= dict.fromkeys((errno.EACCES, errno.EPERM, errno.EROFS), NO_PERMISSION)
-"""Messages about files that cannot be written, by the system's number."""
+"""Pairs of found and expected, for files that may not be written, by errno."""
 
 
 def compose(*arguments: str) -> dict[str, Any]:
-    """Compose the configuration that a command line of group choices and keys comes to, resolved, for programs.
+    """Compose the resolved configuration of a command line of group choices and keys, for programs.
 
-    :func:`explain` has the words for what Hydra raises.
+    :func:`explain` words the errors that Hydra raises.
     """
     given = prepared(arguments)
     refuse_several(given)
@@ -56,7 +56,7 @@ def compose(*arguments: str) -> dict[str, Any]:
 
 
 def prepared(arguments: Sequence[str]) -> list[str]:
-    """Make a command line that Hydra can compose, and refuse at once what it would refuse later or not at all.
+    """Rewrite a command line so that Hydra can compose it; refuse what Hydra would refuse later or not at all.
 
     Raises:
         CTMError, HydraException: see :func:`check_choices`.
@@ -74,7 +74,7 @@ def check(arguments: Sequence[str]) -> list[str]:
     Torch is not imported for it, unless a folder is to be read.
 
     Raises:
-        CTMError, HydraException: there is such a choice, key or value.
+        CTMError, HydraException: a choice, key or value cannot be used.
     """
     ready = prepared(arguments)
     if not elsewhere(ready):  # only Hydra itself finds what lies there
@@ -93,20 +93,20 @@ def check_values(config: DictConfig, arguments: Sequence[str]) -> None:
 
 
 def at_work(folder: str | Path | None = None) -> AbstractContextManager[None]:
-    """Hydra, with the choices in this folder, by default our own."""
+    """Context with Hydra initialised on the choices in a folder, by default the package's ``conf``."""
     return hydra.initialize_config_dir(os.path.abspath(folder or conf_dir()), "cli", version_base="1.3")
 
 
 def elsewhere(arguments: Sequence[str]) -> bool:
-    """Tell whether choices may lie in other folders too."""
+    """Tell whether a command line makes Hydra search other folders for choices too."""
     return any(argument.startswith(FOLDER_FLAGS) for argument in arguments)
 
 
 def refuse_several(arguments: Sequence[str]) -> None:
-    """Refuse several values where there is no sweep.
+    """Refuse several values for one key where there is no sweep.
 
     Raises:
-        ConfigError: there are some.
+        ConfigError: a key has several.
     """
     for each in [] if is_sweep(arguments) else parsed(arguments):
         if each.is_sweep_override():
@@ -116,18 +116,18 @@ def refuse_several(arguments: Sequence[str]) -> None:
 
 
 def parsed(arguments: Iterable[str]) -> list[Override]:
-    """Read those of a command line's arguments that are no flags, nor what belongs to a flag."""
+    """Parse the overrides of a command line: its arguments without flags and flags' values."""
     given = (each for each in arguments if each.startswith("~") or ("=" in each and not each.startswith("-")))
     return grammar().parse_overrides(list(given))
 
 
 def composed(arguments: Sequence[str], name: str = "config", whole: bool = False) -> DictConfig:
-    """Compose what a prepared command line comes to before anything is decided; of a sweep, its first run.
+    """Compose a prepared command line's configuration, with ``auto`` undecided; of a sweep, its first run.
 
     Args:
         arguments: see :func:`prepared`.
-        name: of the file that it starts from.
-        whole: whether Hydra's own part is wanted.
+        name: name of the primary configuration file.
+        whole: whether the section ``hydra`` is included.
     """
     overrides = []
     for each in parsed(each for each in arguments if whole or not each.startswith("hydra")):
@@ -139,11 +139,11 @@ def composed(arguments: Sequence[str], name: str = "config", whole: bool = False
 
 
 def without_hydras(config: DictConfig, geometry: str = AUTO) -> dict[str, Any]:
-    """Resolve a configuration to plain containers, without Hydra's own part and what is a sweep's.
+    """Resolve a configuration to plain containers, without the sections ``hydra`` and ``sweep``.
 
     Args:
         config: as Hydra composed it.
-        geometry: in place of one that is yet to be found.
+        geometry: the geometry in place of one that is yet to be found.
     """
     own = OmegaConf.masked_copy(config, [key for key in config if key not in ("hydra", "sweep")])
     if own.dataset.get("geometry") == AUTO:
@@ -152,12 +152,12 @@ def without_hydras(config: DictConfig, geometry: str = AUTO) -> dict[str, Any]:
 
 
 def check_choices(arguments: Sequence[str]) -> None:
-    """Refuse what cannot be read, and unknown choices and sections.
+    """Refuse arguments that cannot be read, and unknown choices and sections.
 
     Hydra takes ``true`` for a choice of its own, and of a sweep composes one run after the other.
 
     Raises:
-        ConfigError: there is such a value.
+        ConfigError: an argument, choice or section cannot be used.
     """
     known_here = not elsewhere(arguments)
     folders = {path.stem for path in conf_dir().iterdir()}  # such as budget, which nobody needs to name
@@ -186,7 +186,7 @@ def check_choices(arguments: Sequence[str]) -> None:
 
 
 def everywhere() -> list[str]:
-    """List the dotted keys of all of our choices: one of them may be meant by a key that stands in the wrong place."""
+    """List the dotted keys of all built-in choices, for the guess which key a misplaced one was meant for."""
     names = {
         f"{section}.{key}"
         for section, registry in REGISTRIES.items()
@@ -198,7 +198,7 @@ def everywhere() -> list[str]:
 
 
 def explain(error: Exception) -> str:
-    """Word an error's message; of Hydra's with the known choices or keys where one is unknown, of files the way out."""
+    """Word an error for users: Hydra's with the known choices or keys, errors of files with a way out."""
     if isinstance(error, OSError) and error.filename is not None and error.errno in DISK_ERRORS:
         fault, expected = DISK_ERRORS[error.errno]
         return str(DataError(error.filename, f"{fault} ({error.strerror})", expected))

@@ -1,4 +1,4 @@
-"""The data of a run: where they lie now, and whether they are what it was trained on."""
+"""The data of a run: the folder where they lie now, and a check that they are those it was trained on."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ DATA_FILE = "data.json"
 
 
 def note_data(run: Path, config: Config, scene: Any) -> None:
-    """Write down where a run's data lie, and what they are."""
+    """Write a run's note on its data: folder and fingerprints."""
     folder = config["dataset"].get("root")
     places = {}
     if folder is not None:
@@ -30,13 +30,13 @@ def note_data(run: Path, config: Config, scene: Any) -> None:
 
 
 def located(config: Config, run: Path, root: str | None = None) -> Config:
-    """Give a run's configuration with the folder where its data lie now.
+    """Find the folder where a run's data lie now; give the run's configuration with it.
 
-    It is looked for where it was, where it lay from the run, and by its name in the folders above the run.
+    Places tried: its absolute path, its path relative to the run, and its name in the folders above the run.
 
     Raises:
-        ConfigError: ``root`` is given, which says where it is, and the run's data have no folder.
-        CheckpointError: the folder is nowhere.
+        ConfigError: ``root`` is given, but the run's data have no folder.
+        CheckpointError: the folder is not found.
     """
     node = config["dataset"]
     if "root" not in node:
@@ -69,13 +69,13 @@ def _note(run: Path) -> dict[str, Any]:
 
 
 def check_data(run: Path, scene: Any, refuse: bool = False) -> bool:
-    """Tell, once, that a run was trained on other data than these.
+    """Compare a scene's fingerprints with those of a run's training data; warn once, or ``refuse``, if they differ.
 
     Returns:
-        Whether they are known to be the same.
+        Whether the data are known to be the same.
 
     Raises:
-        CheckpointError: it was, and is to be refused.
+        CheckpointError: the data differ, and ``refuse`` is set.
     """
     before = _note(run).get("parts")
     if not is_main_process() or not isinstance(before, dict):

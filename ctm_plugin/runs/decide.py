@@ -1,4 +1,4 @@
-"""What a configuration leaves to the program, ``auto``: found from the capture and the machine, and said."""
+"""Values of settings that are ``auto``: decided from the capture and the machine, and printed."""
 
 from __future__ import annotations
 
@@ -25,15 +25,15 @@ QUICK_PIXELS = 300**2
 
 
 def decide(config: DictConfig) -> Capture | None:
-    """Put in ``dataset.geometry``, ``trainer.budget`` and, for splats, ``trainer.accelerator`` where they are ``auto``.
+    """Decide ``dataset.geometry``, ``trainer.budget`` and, for splats, ``trainer.accelerator`` where they are ``auto``.
 
-    A line tells of each, with the reason.
+    It prints a line for each decision, with the reason.
 
     Args:
         config: as Hydra composed it.
 
     Returns:
-        What was read for it, so that it is not read again.
+        The capture that was read to decide, so that it is not read again; ``None``: none was.
     """
     dataset, decided = OmegaConf.to_container(config.dataset, resolve=True, throw_on_missing=False), {}
     capture, rig = _read(dataset) if AUTO in (dataset.get("geometry"), config.trainer.budget) else (None, None)
@@ -53,7 +53,7 @@ def decide(config: DictConfig) -> Capture | None:
 
 
 def budget(rig: Rig | None, accelerator: str) -> tuple[str, str]:
-    """Choose the budget by the device and the pictures' size, and say why."""
+    """Choose the budget by the device and the pictures' size; give the reason in words."""
     if accelerator != "cpu" and has_gpu():
         return "standard", "there is a GPU"
     if rig is not None and rig.size[0] * rig.size[1] > QUICK_PIXELS:
@@ -62,19 +62,19 @@ def budget(rig: Rig | None, accelerator: str) -> tuple[str, str]:
 
 
 def has_gpu() -> bool:
-    """Whether torch has found one."""
+    """Whether torch has found a CUDA GPU."""
     import torch
 
     return torch.cuda.is_available()
 
 
 def composites_there() -> bool:
-    """Whether a GPU has kernels for splats: by plain torch they are many times slower than by a processor's loops."""
+    """Whether the GPU has kernels for splats: in plain torch splats are many times slower than by a CPU's loops."""
     return find_spec("triton") is not None
 
 
 def _read(dataset: dict[str, Any]) -> tuple[Capture | None, Rig | None]:
-    """What the files of a data set say, and how its cameras stand; errors are raised when the run is built."""
+    """Read a data set's capture and its cameras' arrangement; errors give ``None``, as building the run raises them."""
     capture = rig = None
     with suppress(CTMError):
         kind = DATASETS.get(str(dataset.get("name")))

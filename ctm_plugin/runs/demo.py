@@ -58,7 +58,7 @@ def demo(others: Sequence[str] = ()) -> None:
 
 
 def comparison(console: Console, results: dict[str, dict]) -> Table:
-    """A row a run, and what each is above or below the first."""
+    """Table with a row of scores for each run, and its differences from the first run."""
     metrics, table = told_at("demo"), table_for(console)
     table.add_column("")
     for metric in metrics.values():
@@ -74,7 +74,7 @@ def comparison(console: Console, results: dict[str, dict]) -> Table:
 
 
 def write_demo(runs: Mapping[str, Path], results: Mapping[str, Mapping[str, Any]], path: Path, view: int = 3) -> None:
-    """One test view of some runs, lit, each under its photograph, and its depth, as a page."""
+    """Write a page with one test view of each run, lit, under its photograph, and its depth."""
     shots = []
     for ctm, run in runs.items():
         module = load_run(run).module
@@ -90,14 +90,14 @@ def write_demo(runs: Mapping[str, Path], results: Mapping[str, Mapping[str, Any]
 
 
 def advice(results: Mapping[str, Mapping[str, Any]]) -> str:
-    """Say which of the runs is closest to the photographs in the light, and whether that is the default."""
+    """Word which run is closest to the photographs when lit, and whether its transform is the default."""
     best = max(results, key=lambda ctm: results[ctm]["psnr_enhanced"])
     default = "the default" if best == "auto" else "though ctm=auto is the default"
     return f"Closest to the photographs here: ctm={best}, {default}."
 
 
 def _text(value: float | None, metric: Metric, sign: str = "") -> str:
-    """Scores without their units, to three decimals at most."""
+    """Text of a score without its unit, to three decimals at most."""
     if value is None:
         return "-"
     number = f"{value:{sign}.{min(metric.decimals, 3)}f}"

@@ -1,4 +1,4 @@
-"""Render and score the test views; as a command, of a finished or interrupted run from its checkpoint."""
+"""Rendering and scoring of a run's test views, after training or from its checkpoint."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from ctm_plugin.show.console import print_summary
 LITTLE_DETAIL = 0.25
 """Score ``detail`` below which a run warns: four runs that failed had 0.01 at most, eleven others 0.5 at least."""
 SHORT_BUDGETS = ("smoke", "check", "quick")
-"""Budgets that are too short for such a warning."""
+"""Budgets too short for the warning of little detail."""
 
 
 def score(
@@ -36,14 +36,14 @@ def score(
     """Have a trained backbone score itself and write its pictures and ``metrics.json`` into ``folder``.
 
     Args:
-        module, config: the run's.
+        module, config: the run's backbone and configuration.
         folder: to write to.
         lpips: what :func:`ctm_plugin.metrics.lpips_weights.load_lpips` returned.
-        steps, spent: of its training, see :class:`ctm_plugin.runs.load.LoadedRun`.
-        light: what lit pictures are shown in.
+        steps, spent: steps, seconds and memory of its training, see :class:`ctm_plugin.runs.load.LoadedRun`.
+        light: settings of the light in which pictures are displayed.
 
     Returns:
-        What ``metrics.json`` holds.
+        The content of ``metrics.json``.
     """
     with fast_products(module.device):
         result = module.scores(folder, Scoring(config["dataset"], lpips, light, tracked))
@@ -74,7 +74,7 @@ def score(
 
 
 def lpips_for(parts: Parts) -> tuple[LPIPS | None, str]:
-    """Load LPIPS for a run, see :func:`load_lpips`; nothing is downloaded where no test view has a picture."""
+    """Load LPIPS for a run, see :func:`load_lpips`; without a photographed test view nothing is downloaded."""
     settings, views = parts.metrics, parts.backbone.scene.test if parts.backbone.posed else None
     scored = views is not None and (views.pictured is None or bool(views.pictured.any()))
     if not scored and settings.lpips_weights is None:
@@ -83,9 +83,9 @@ def lpips_for(parts: Parts) -> tuple[LPIPS | None, str]:
 
 
 def warn_of_failed_views(scores: Mapping[str, Any], budget: str | None) -> None:
-    """Warn, and say what to try, where lit views show less than the photographs do that are only lit.
+    """Warn, with advice, where rendered lit views are worse than the brightened photographs.
 
-    That is where they show little of the photographs' detail, or where references are known and both PSNR and SSIM
+    That is where views show little of the photographs' detail, or where there are lit references and both PSNR and SSIM
     prefer the photographs.
     """
     faults = []

@@ -1,4 +1,4 @@
-"""A run for other programs: splats, points, a mesh, depth, cameras, lit pictures; and a page for people."""
+"""Exports of a run for other programs: splats, points, a mesh, depth, cameras, lit pictures; and a page for people."""
 
 from __future__ import annotations
 
@@ -95,7 +95,7 @@ def export(run: Path, settings: ExportConfig) -> None:
 
 
 def export_page(run: Path, posed: LoadedRun, path: Path, settings: ExportConfig) -> None:
-    """Write a run's page."""
+    """Write a run's HTML page to ``path``."""
     write_page(path, run, posed, chosen_light(settings, posed.light))
 
 

@@ -1,4 +1,4 @@
-"""A run read again from its directory: its checkpoint, its module with its weights, pictures of it from any camera."""
+"""Loading of a run from its directory: its checkpoint, its module with weights, pictures of it from any camera."""
 
 from __future__ import annotations
 
@@ -44,9 +44,9 @@ class LoadedRun:
     """A run as it was at its last checkpoint.
 
     Attributes:
-        parts: with weights.
-        config: the run's.
-        step: of its checkpoint.
+        parts: the run's objects, with trained weights.
+        config: the run's configuration.
+        step: optimizer step of the checkpoint.
         spent: seconds and memory of its training, see :class:`ctm_plugin.callbacks.stopwatch.Stopwatch`.
     """
 
@@ -61,14 +61,14 @@ class LoadedRun:
 
     @cached_property
     def light(self) -> Light:
-        """Light in which its pictures are displayed by default."""
+        """Light in which the run's pictures are displayed by default."""
         return self.module.light
 
     def render(
         self, c2w: Float[np.ndarray, "r 4"], intrinsics: Sequence[float], width: int, height: int,
         kind: str = "lit",
     ) -> Float[Tensor, "h w 3"]:  # fmt: skip
-        """A picture from any camera, on the CPU, of a run of a scene with cameras.
+        """Render a picture from any camera, on the CPU; the run's scene must have cameras.
 
         Args:
             c2w: camera to world in the world of the run's files, ``[3, 4]`` or ``[4, 4]``; x right, y up, looking
@@ -78,7 +78,7 @@ class LoadedRun:
             kind: one of :data:`VIEW_KINDS`.
 
         Returns:
-            sRGB in [0, 1], or what depths and latents look like.
+            sRGB in [0, 1]; depths and latents as colours.
         """
         pose = (self.module.scene.world or IDENTITY).of_poses(np.asarray(c2w, dtype=np.float64)[None, :3])
         views = Views(
@@ -90,19 +90,19 @@ class LoadedRun:
         return self.picture({name: value.float().cpu() for name, value in view.items()}, kind)
 
     def gaussians(self) -> Gaussians:
-        """The splats of such a run in lit sRGB and the world of its files, as ``ctm export`` writes them.
+        """The run's Gaussians in lit sRGB and the world of its files, as ``ctm export`` writes them.
 
         Raises:
-            CTMError: it has none.
+            CTMError: the run has no Gaussians.
         """
         if not isinstance(self.module, Splat):
             raise CTMError(f"found a run of {type(self.module).__name__}, expected one of splats")
         return plain(self.module, self.light, TRAIN_STEPS)
 
     def picture(self, view: dict[str, Tensor], kind: str, light: Light | None = None) -> Float[Tensor, "h w 3"]:
-        """One of :data:`VIEW_KINDS` out of what :meth:`PosedBackbone.render_view` returned, on the CPU.
+        """Make a picture of one of :data:`VIEW_KINDS` out of a :meth:`PosedBackbone.render_view` result, on the CPU.
 
-        ``light`` is what lit pictures are shown in; the scene's own where it is ``None``.
+        ``light`` is the light of lit pictures; ``None``: the scene's own.
         """
         if kind == "depth":
             return depth_picture(view["depth"], self.module.scene.near, self.module.scene.far)
@@ -116,12 +116,12 @@ def load_run(run: Path, root: str | None = None, pictures: bool = True, scene: A
 
     Args:
         run: its directory.
-        root: the folder of its data, where that is not found from the run; other data than it had are warned of.
-        pictures: whether they are wanted; else the run's own note of its cameras does where the data are nowhere.
-        scene: the run's, where it has been read already.
+        root: the folder of its data, where that is not found from the run; a warning tells of other data.
+        pictures: whether the data's pictures are needed; else the run's file of cameras suffices if data are missing.
+        scene: the run's scene, where it has been read already.
 
     Raises:
-        CTMError: the folder is no run, its data are nowhere, or its checkpoint cannot be used.
+        CTMError: the folder is no run, its data are not found, or its checkpoint cannot be used.
     """
     keep_memory()
     config = load_config(run)
@@ -157,10 +157,10 @@ def load_posed(run: Path, root: str | None = None, pictures: bool = True, scene:
 
 
 def restore(parts: Parts, checkpoint: dict[str, Any], path: Path) -> None:
-    """Put a checkpoint's weights into the parts that its configuration gives.
+    """Load a checkpoint's weights into the module of a run's parts.
 
     Raises:
-        CheckpointError: they do not fit, as when another version of a backbone made them.
+        CheckpointError: the weights do not fit, as when another version of a backbone made them.
     """
     module = parts.backbone
     try:
@@ -178,8 +178,8 @@ def load_checkpoint(run: Path, config: Config, name: str = LAST) -> dict[str, An
     """Read a checkpoint of a run, by default the last one, with ``weights_only=True``.
 
     Raises:
-        CheckpointError: there is none, it cannot be read (the one before it is offered), or it was made with another
-            configuration.
+        CheckpointError: there is no checkpoint, it cannot be read (the one before it is offered), or it was made with
+            another configuration.
     """
     path = run / name
     if not path.is_file():
@@ -203,7 +203,7 @@ def load_checkpoint(run: Path, config: Config, name: str = LAST) -> dict[str, An
 
 
 def _is_checkpoint(content: Any) -> bool:
-    """Whether this is what our runs save, as far as we read it ourselves."""
+    """Whether content has the form of a run's checkpoint, in the entries that this package reads itself."""
     try:
         spent, steps = content["callbacks"]["Stopwatch"], [content[key] for key in ("batches_seen", "global_step")]
         return (
@@ -224,10 +224,10 @@ def go_back(path: Path) -> Path:
         path: ``RUN/checkpoints/previous.ckpt``.
 
     Returns:
-        The run.
+        The run's directory.
 
     Raises:
-        CheckpointError: it is another file, or cannot be used.
+        CheckpointError: ``path`` is another file, or cannot be used.
     """
     run = path.parent.parent
     if path.resolve() != (run / PREVIOUS).resolve():

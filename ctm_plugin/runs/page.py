@@ -1,4 +1,4 @@
-"""A run as one page of HTML, for people who have a browser and nothing else."""
+"""A run as one HTML page without other files, for any browser."""
 
 from __future__ import annotations
 
@@ -38,13 +38,13 @@ from ctm_plugin.splats.seen import as_wide_as_pixels, pixels_made, times_seen
 from ctm_plugin.splats.start import SH_C0
 
 LIMIT = 10_000_000
-"""Most bytes of a page: mail takes them."""
+"""Most bytes of a page, so that it can be sent by mail."""
 MAX_FILM_BYTES = MAX_PICTURE_BYTES = 2_500_000
-"""Bytes of these before they are written as text, which makes four of three."""
+"""Most bytes of a page's film, and of its pictures, before base64, which makes four bytes of three."""
 MAX_VIEWS, MAX_WIDTH, QUALITY = 12, 1280, 80
 """Most test views, their largest width in pixels, and WebP's quality."""
 SHRINK = 0.8
-"""Factor on widths, repeated until all fits."""
+"""Factor on pictures' widths, repeated until they fit into their bytes."""
 COLOR_STEPS, COLOR_WIDTH = 100, 400
 """Steps of the training of colours, and the width in pixels of its pictures: 42.4 dB from a run's pictures, 44.9 after
 six times as many steps (LOM's bike, 370 pixels wide)."""
@@ -69,8 +69,8 @@ class PageView(NamedTuple):
 def write_page(path: Path, run: Path, posed: LoadedRun, light: Light) -> None:
     """Write a run as a page that opens from a file, loads nothing, and has less than ten million bytes.
 
-    It shows the film that the run has, test views next to their photographs, and of splats the scene to walk through.
-    What had to be made smaller or left out for that is printed.
+    It shows the run's newest film, test views next to their photographs, and of splats the scene to walk through.
+    It prints which parts had to be made smaller or left out.
     """
     module, film = posed.module, film_of(run)
     scores = read_json(run / METRICS) if (run / METRICS).exists() else {}
@@ -93,7 +93,7 @@ def write_page(path: Path, run: Path, posed: LoadedRun, light: Light) -> None:
 
 
 def page(run: Path, posed: LoadedRun, light: Light, scores: Mapping[str, Any], parts: Mapping[str, Any]) -> str:
-    """A run as HTML that needs nothing else."""
+    """A run's page as HTML that needs no other file."""
     return html(
         "page",
         name=posed.module.scene.name,
@@ -105,14 +105,14 @@ def page(run: Path, posed: LoadedRun, light: Light, scores: Mapping[str, Any], p
 
 
 def html(kind: str, **values: Any) -> str:
-    """A page of a kind with its values, names escaped."""
+    """Fill a template of a page with values, text escaped."""
     environment = Environment(loader=PackageLoader("ctm_plugin.runs", "."), autoescape=True)
     environment.policies["json.dumps_kwargs"] = {"ensure_ascii": False}
     return environment.get_template(f"{kind}.html.jinja").render(version=__version__, **values)
 
 
 def facts(posed: LoadedRun, light: Light, scores: Mapping[str, Any]) -> list[str]:
-    """What was chosen, and how good it is, in plain words."""
+    """Sentences on a run's settings and scores, for its page."""
     scene, config = posed.module.scene, posed.config
     known, kept = len(scene.train), len(scene.test)
     sentences = [f"The scene was learned from {known} photographs. {kept} places were held back, to test it."]
@@ -133,8 +133,7 @@ def facts(posed: LoadedRun, light: Light, scores: Mapping[str, Any]) -> list[str
 
 
 def shots_of(module: PosedBackbone, light: Light) -> tuple[list[PageView], tuple[int, int]]:
-    """The test views, evenly chosen, rendered and photographed, as large as there is room for; the film's width and
-    height."""
+    """Test views, evenly chosen, rendered and photographed, as large as the page has room, and the film's size."""
     views = module.scene.test
     chosen = np.unique(np.linspace(0, len(views) - 1, min(MAX_VIEWS, len(views))).round().astype(int)).tolist()
     if len(chosen) < len(views):
@@ -166,7 +165,7 @@ def shots_of(module: PosedBackbone, light: Light) -> tuple[list[PageView], tuple
 
 
 def webp(picture: Image.Image, width: int) -> bytes:
-    """A picture as a file, at most so many pixels wide."""
+    """Encode a picture as WebP, at most ``width`` pixels wide."""
     small = picture.copy()
     small.thumbnail((width, picture.height))
     out = io.BytesIO()
@@ -175,17 +174,17 @@ def webp(picture: Image.Image, width: int) -> bytes:
 
 
 def picture_url(picture: Image.Image) -> str:
-    """A picture as a data URL, as large as it is."""
+    """Encode a picture as a data URL, at its own size."""
     return url("image/webp", webp(picture, picture.width))
 
 
 def url(kind: str, content: bytes) -> str:
-    """A file as a data URL."""
+    """Encode a file's content as a data URL of a media type."""
     return f"data:{kind};base64,{base64.b64encode(content).decode()}"
 
 
 def film_url(film: Path) -> str:
-    """A film as a data URL; a GIF as WebP; smaller where it has too many bytes."""
+    """Encode a film as a data URL, a GIF as WebP, smaller where it has too many bytes."""
     content, ending = film.read_bytes(), ".mp4" if film.suffix == ".mp4" else ".webp"
     if film.suffix != ending or len(content) > MAX_FILM_BYTES:
         frames = iio.imread(film, index=None if film.suffix == ".mp4" else ...)
@@ -204,11 +203,11 @@ def film_url(film: Path) -> str:
 
 
 def walk_of(module: Splat, light: Light, room: int) -> str:
-    """The scene in a viewer: what two training cameras and more see, the least visible left out where room is short.
+    """HTML of a viewer with the Gaussians that two or more training cameras see, the least visible left out for room.
 
     Args:
-        module: with its weights.
-        light: for its colours.
+        module: the backbone with trained weights.
+        light: light of the Gaussians' colours.
         room: bytes that the viewer may have in the page.
     """
     scene, every = module.scene, math.ceil(module.scene.train.width / COLOR_WIDTH)
@@ -224,7 +223,7 @@ def walk_of(module: Splat, light: Light, room: int) -> str:
 
 
 def spots_of(gaussians: Gaussians) -> Spots:
-    """Gaussians of three channels, with one colour each, as numbers."""
+    """The viewer's spots out of Gaussians of three channels, one colour each."""
     axes = rotations(gaussians.quats) * gaussians.scales.exp()[:, None]
     colors = (0.5 + SH_C0 * gaussians.sh0).clamp(0, 1)
     tables = gaussians.means, axes, colors, gaussians.opacities.sigmoid()
@@ -232,9 +231,9 @@ def spots_of(gaussians: Gaussians) -> Spots:
 
 
 def start_of(module: Splat, cameras: Sequence[Camera]) -> Start:
-    """The training camera in the middle of all, in the files' world, and what is in the middle of its picture.
+    """Start of a walk: the training camera nearest to the mean of all, in the files' world, facing as it did.
 
-    Up is what is up in the mean photograph.
+    The up direction is that of the mean photograph.
     """
     views, back = module.scene.train, (module.scene.world or IDENTITY).inverse()
     centres = torch.stack([camera.centre for camera in cameras])

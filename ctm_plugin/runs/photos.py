@@ -1,4 +1,4 @@
-"""From a folder of photographs to lit views, a film and a page: one command that decides what there is to decide."""
+"""The verb ``photos``: lit views, a film and a page of a folder of photographs, with all settings decided by itself."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def photos(folder: Path, settings: PhotosConfig, others: Sequence[str] = ()) -> 
     it was stopped, the same command goes on. It prints what it decides; a key overrules it, such as dataset.width=800.
 
     Args:
-        folder: the photographs', or a clip.
+        folder: folder of the photographs, or a clip.
         settings: how long training may take.
         others: choices and keys of the run.
 
@@ -103,7 +103,7 @@ def check_writable(run: Path) -> None:
     """Refuse a place where no run can be written, before time is spent on one.
 
     Raises:
-        CheckpointError: it is one.
+        CheckpointError: the place cannot be written.
     """
     there = next(each for each in (run, *run.parents) if each.exists()).absolute()
     try:
@@ -114,7 +114,7 @@ def check_writable(run: Path) -> None:
 
 
 def parts(root: Path, seconds: float) -> dict[str, float]:
-    """Guess how many seconds each part takes, for the bar over all of them."""
+    """Guess the seconds of each part of the command, for the progress bar over all of them."""
     count = sum(map(is_picture, below(home_of(root, DEFAULT_FOLDER))))
     finding = {} if layouts(root) else {"brightness": 0.1, "details": 0.5, "pairs": 0.5, "placed": 0.4, "refined": 0.4}
     times = {what: count * each for what, each in finding.items()}
@@ -144,7 +144,7 @@ def run_folder(root: Path, again: bool) -> Path:
 
 
 def choices(root: Path, minutes: float, others: Sequence[str], say: Callable[[str], None]) -> list[str]:
-    """Choose the layout, the pictures' width and the budget, and say so; what is given stays."""
+    """Choose the layout, the pictures' width and the budget, and print them; keys that are given stay."""
     import torch
 
     from ctm_plugin.cameras.exposures import UNEVEN, spread_of_gains

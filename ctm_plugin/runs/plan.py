@@ -1,4 +1,4 @@
-"""Width of training pictures and budget by which splats are ready in time, by timing real steps."""
+"""Choice of picture width and budget so that splats are trained in time, by timing real steps."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from ctm_plugin.draws import Draws
 from ctm_plugin.runs.assemble import Parts
 
 BUDGET_STEPS = {"standard": 2500, "quick": 1500}
-"""Steps of splats by budget."""
+"""Number of training steps of splats by budget."""
 COLUMNS = {"standard": 300, "quick": 160}
-"""Least width of pictures in pixels that a budget is worth by budget."""
+"""Least width of pictures in pixels, by budget, for which the budget is worth its time."""
 MAX_COLUMNS = 1600
 """Largest width in pixels: more show no more than a few minutes can learn."""
 TIMED_COLUMNS = 300
@@ -38,7 +38,7 @@ WIDER_FACTOR = 1.6
 
 
 class Timed(NamedTuple):
-    """Seconds of a step on one thread, on average of a training on pictures of so many pixels."""
+    """Mean seconds of a training step on one thread, and the pixels of the pictures that it was timed on."""
 
     seconds: float
     pixels: int
@@ -49,7 +49,7 @@ REFERENCE = Timed(0.04, 300 * 225)
 
 
 class Plan(NamedTuple):
-    """Width and budget of a training, and a line on them, which may be empty."""
+    """Picture width and budget of a training, and a line that explains them, which may be empty."""
 
     width: int
     budget: str
@@ -59,7 +59,7 @@ class Plan(NamedTuple):
 def timed_steps(parts: Parts) -> Timed:
     """Time training steps on one thread, by the processor's clock, which does not count what other programs take.
 
-    Gaussians are as many, and as large on the picture, as they are in the middle of a training.
+    The number and size of the Gaussians are those in the middle of a training.
     """
     module, threads = parts.backbone, torch.get_num_threads()
     fitted(module.transform, module.some_colors())
@@ -82,7 +82,7 @@ def timed_steps(parts: Parts) -> Timed:
 
 @torch.no_grad()
 def _grow(module: Splat) -> None:
-    """Take Gaussians at random places between those that a module begins with, of sizes found in trained ones."""
+    """Give a module Gaussians at random places between its initial ones, of the size of trained Gaussians."""
     draws, views, tables = Draws(module.seed, 0, stream="plan"), module.scene.train, module.gaussians
     one, other = (draws.integers(len(tables.means), TIMED_GAUSSIANS) for _ in range(2))
     means = tables.means[one].lerp(tables.means[other], 0.01)
@@ -103,14 +103,14 @@ def _grow(module: Splat) -> None:
 def plan(
     size: tuple[int, int], minutes: int | float, timed: Timed | None, threads: int = 1, given: bool = False
 ) -> Plan:
-    """Choose the pictures' width and the budget that splats are trained with in so many minutes.
+    """Choose the pictures' width and the budget with which splats are trained in ``minutes``.
 
     Args:
         size: height and width of the photographs.
-        minutes: of training.
+        minutes: time of the training.
         timed: how long a step takes here; ``None`` on a GPU, which has time for any.
-        threads: on which loops run.
-        given: whether the size is not to be chosen.
+        threads: number of threads on which loops run.
+        given: whether the width is fixed by the user.
     """
     width = size[1]
     limit = width if given else min(width, MAX_COLUMNS)
@@ -133,7 +133,7 @@ def plan(
 
 
 def _seconds(pixels: int | float, timed: Timed, threads: int) -> float:
-    """Guess what a step takes, on average of a training."""
+    """Guess the mean seconds of a training step on pictures of ``pixels``."""
     shared = SERIAL_SHARE + (1 - SERIAL_SHARE) / threads
     return shared * timed.seconds * (pixels + FIXED_PIXELS) / (timed.pixels + FIXED_PIXELS)
 

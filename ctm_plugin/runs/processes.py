@@ -32,10 +32,10 @@ def processes(run: Path, count: int) -> Iterator[None]:
 
     Args:
         run: a run directory with its configuration.
-        count: processes in all.
+        count: number of processes, this one included.
 
     Raises:
-        CTMError: one of them failed.
+        CTMError: another process failed.
     """
     if count == 1 or "LOCAL_RANK" in os.environ:
         yield
@@ -70,7 +70,7 @@ def processes(run: Path, count: int) -> Iterator[None]:
 
 
 def _failure(others: list[subprocess.Popen], seconds: float) -> str | None:
-    """The process that failed, if one does within so many seconds."""
+    """Description of the first process that fails within ``seconds``; ``None``: none does."""
     until = time.monotonic() + seconds
     while True:
         for rank, process in enumerate(others, start=1):
@@ -91,7 +91,7 @@ def _watch(others: list[subprocess.Popen], done: threading.Event) -> None:
 
 
 def _end(others: list[subprocess.Popen], patience: float) -> None:
-    """Let the processes end by themselves for so many seconds, then make them."""
+    """Let the processes end by themselves for ``patience`` seconds, then end them."""
     for process in others:
         with suppress(subprocess.TimeoutExpired):
             process.wait(patience)

@@ -19,14 +19,14 @@ from torch import Tensor
 from ctm_plugin import __version__
 
 PACKAGES = ("torch", "lightning", "numpy", "hydra-core", "omegaconf", "torchmetrics", "scikit-image", "imageio")
-"""Packages whose versions a run notes."""
+"""Packages whose versions ``metrics.json`` records."""
 
 
 def fingerprint(data: Any) -> str:
     """Hash a data set as it was loaded, by BLAKE2b: dataclasses, tensors, arrays, containers, plain values.
 
-    Two data sets with one fingerprint hold the same pixels, cameras, bounds and settings, wherever their files lie. It
-    is of bits: where cameras or pixels are computed in loading, another kind of processor may give another.
+    Two data sets with one fingerprint hold the same pixels, cameras, bounds and settings, wherever their files lie. All
+    bits count: where loading computes cameras or pixels, another kind of processor may give another fingerprint.
     """
     digest = hashlib.blake2b(digest_size=16)
     _add(digest, data)

@@ -1,4 +1,4 @@
-"""A run directory: what is in it, which one a word names, and reading it without trusting it."""
+"""Run directories: finding them by name, and writing and reading their files without executing anything."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from ctm_plugin.settings.build import SECTIONS, Config
 
 CONFIG, METRICS, ERROR, PAGE = "config.yaml", "metrics.json", "error.txt", "index.html"
 ALL = "all"
-"""Folder of all views, lit."""
+"""Name of the folder of all lit views, training views included."""
 LAST, PREVIOUS, DAMAGED = (f"checkpoints/{name}.ckpt" for name in ("last", "previous", "damaged"))
 NEWEST_LINK = Path("last")
 """Link to the newest run."""
@@ -37,8 +37,8 @@ Loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # ten times as fast, whe
 def runs_of(path: Path) -> list[Path]:
     """Find the runs that a word names, the newest last.
 
-    It is a run's directory, its last checkpoint, a folder of runs, or ``last``: the newest run there is, unless
-    something has that name. What is none of these comes back as it is, for whoever reads it to refuse.
+    The word is a run's directory, its last checkpoint, a folder of runs, or ``last``: the newest run there is, unless
+    a file has that name. Any other path is returned unchanged, and refused when it is read.
 
     Raises:
         CheckpointError: ``last`` is given, and there are no runs.
@@ -53,7 +53,7 @@ def runs_of(path: Path) -> list[Path]:
 
 
 def _below(*folders: Path) -> list[Path]:
-    """The runs in folders, by the time that each began; those in hidden folders are others' programs'."""
+    """The runs in folders, by the time that each began; hidden folders, which belong to other programs, are skipped."""
     configs = (config for folder in folders for config in folder.rglob(CONFIG))
     seen = [config for config in configs if not any(part.startswith(".") for part in config.parts if part != "..")]
     return [config.parent for config in sorted(seen, key=lambda config: (config.stat().st_mtime_ns, config))]
@@ -66,7 +66,7 @@ def new_folder(first: Path) -> Path:
 
 
 def _taken(folder: Path) -> bool:
-    """Whether this process, of all that are beginning runs, was the one to make ``checkpoints`` in a folder."""
+    """Whether this process, and no other that begins a run, made the folder ``checkpoints`` in a run's folder."""
     if (folder / CONFIG).exists():
         return False
     try:
@@ -88,7 +88,7 @@ def save_config(run: Path, config: Config) -> None:
     """Write the version and the resolved configuration into a new run directory, made if need be.
 
     Raises:
-        CheckpointError: a run is there already, or nothing can be written there.
+        CheckpointError: the directory has a run already, or cannot be written.
     """
     try:
         run.mkdir(parents=True, exist_ok=True)
@@ -101,12 +101,12 @@ def save_config(run: Path, config: Config) -> None:
 
 
 def there_already(run: Path) -> CheckpointError:
-    """Make the error for a new run where there is one."""
+    """Make the error for a new run in a directory that has a run."""
     return CheckpointError(run, "a run that is there already", f"a new directory, or resume={shlex.quote(str(run))}")
 
 
 def note_colors(run: Path, description: str | None) -> None:
-    """Let ``config.yaml`` say, in a comment, what was fitted to the scene's colours; ``None``: nothing was."""
+    """Add the description of the transform's fit to ``config.yaml``, as a comment; ``None``: there is no fit."""
     note = f"# fitted to the scene's colours: {description}\n"
     # Added to, not replaced: the lock is the file's.
     with (run / CONFIG).open("r+", encoding="utf-8") as file:
@@ -116,10 +116,10 @@ def note_colors(run: Path, description: str | None) -> None:
 
 @contextmanager
 def locked(run: Path) -> Iterator[None]:
-    """Keep a run to this process. The lock goes with the process, however it ends.
+    """Context that locks a run's directory for this process. The lock goes with the process, however it ends.
 
     Raises:
-        CheckpointError: another process has it.
+        CheckpointError: another process holds the lock.
     """
     with (run / CONFIG).open("r+", encoding="utf-8") as file:  # for writing, as locks over a network want it
         try:
@@ -170,7 +170,7 @@ def differences(a: Any, b: Any, key: str = "") -> list[str]:
 
 
 def read_yaml(path: Path) -> dict[str, Any]:
-    """Read a mapping of plain values out of YAML: tags, which make objects, and aliases, which go round, are refused.
+    """Read a mapping of plain values out of YAML; tags, which make objects, and aliases, which may loop, are refused.
 
     Raises:
         CheckpointError: it cannot be read, or holds something else.
@@ -208,7 +208,7 @@ def _mapping(value: Any, path: Path) -> dict[str, Any]:
 
 
 def nodes(value: Any, key: str = "") -> Iterator[tuple[Any, str]]:
-    """Go through a nest of containers: every value with its key, such as ``a.b.0``, the nest itself first."""
+    """Iterate over nested containers: every value with its dotted key, such as ``a.b.0``, the outermost first."""
     waiting = [(value, key)]
     while waiting:
         value, key = waiting.pop()

@@ -14,7 +14,7 @@ from ctm_plugin.settings.setting import REQUIRED, Settings, setting
 CAMERA_PATHS = ("capture", "orbit", "spiral", "test")
 """Names of camera paths."""
 EXPORTS = ("splats", "points", "mesh", "depth", "cameras", "pictures", "page")
-"""Names of what a run is exported as."""
+"""Names of the kinds of exports of a run."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,7 +48,7 @@ class TrainerConfig(Settings, section="trainer"):
 
     @property
     def backend(self) -> str:
-        """What trains, ``cuda`` or ``cpu``: Lightning would take Apple's GPUs as well, which have no float64."""
+        """Device that trains, ``cuda`` or ``cpu``: Lightning would take Apple's GPUs as well, which have no float64."""
         import torch
 
         available = self.accelerator == "auto" and torch.cuda.is_available()
@@ -77,10 +77,10 @@ class TrainerConfig(Settings, section="trainer"):
 
     @property
     def strategy(self) -> Any:
-        """One process, or one a device with gradients averaged.
+        """Lightning's strategy: one process, or DDP with one process a device.
 
-        Parts of a model may rest in a step. Buffers follow from the data and the parameters, which all processes share:
-        sending them every step, training pixels and all, would cost more than the step.
+        Parts of a model may be unused in a step. Buffers follow from the data and the parameters, which all processes
+        share: sending them every step, training pixels included, would cost more than the step.
         """
         from lightning.pytorch.strategies import DDPStrategy
 
@@ -174,7 +174,7 @@ def can_mp4() -> bool:
 
 @dataclass(frozen=True, kw_only=True)
 class PhotosConfig(Settings):
-    """How long it may take."""
+    """Settings of ``ctm photos``: the time that it may take."""
 
     minutes: float = setting(
         10.0,

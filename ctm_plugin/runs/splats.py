@@ -1,4 +1,4 @@
-"""A run's Gaussians for other programs: in plain RGB, as lit as people see them, in a file that splat viewers open."""
+"""Export of a run's Gaussians in plain RGB, lit, as a PLY file that splat viewers open."""
 
 from __future__ import annotations
 
@@ -28,19 +28,19 @@ from ctm_plugin.splats.render import picture
 from ctm_plugin.splats.start import SH_C0
 
 TRAIN_STEPS = 600
-"""Steps of training the colours; after half of them pictures are 0.3 dB further from the run's."""
+"""Steps of training the exported colours; after half of them pictures are 0.3 dB further from the run's."""
 LEARNING_RATES = {"sh0": 3e-2, "shN": 6e-3, "opacities": 6e-2}
-"""Learning rates of the trained tables."""
+"""Learning rates of the exported Gaussians' colours and opacities."""
 LR_FINAL = 0.05
-"""Factor that these rates have fallen to at the end."""
+"""Factor that the learning rates have fallen to at the last step."""
 MIN_START = 0.02
-"""Least colour at the start: colours at 0, where they are clipped, would not learn."""
+"""Least initial colour: colours at 0, where they are clipped, would not learn."""
 MAX_CAMERAS = 32
 """Most cameras over which a Gaussian's initial colour is the mean."""
 HARMONIC_SIGNS = torch.tensor([(-1.0) ** order for degree in (1, 2, 3) for order in range(-degree, degree + 1)])
-"""Signs of the file's harmonics above degree 0 over ours, which have no Condon-Shortley phase."""
+"""Signs that turn harmonics above degree 0, without Condon-Shortley phase here, into those of 3DGS's files."""
 PROPERTY_GROUPS = {"f_dc": 3, "f_rest": 3 * len(HARMONIC_SIGNS), "opacity": 1, "scale": 3, "rot": 4}
-"""Names of groups of the file's properties, and how many each has."""
+"""Groups of properties in 3DGS's PLY files, and the number of properties in each."""
 PROPERTIES = [
     "x",
     "y",
@@ -50,7 +50,7 @@ PROPERTIES = [
     "nz",
     *(f"{group}_{i}" for group, size in PROPERTY_GROUPS.items() for i in range(size)),
 ]
-"""Names of the file's properties in their order."""
+"""Names of the properties of 3DGS's PLY files, in order."""
 PROPERTIES[PROPERTIES.index("opacity_0")] = "opacity"
 
 
@@ -60,11 +60,11 @@ def plain(module: Splat, light: Light, steps: int, sided: bool = True, every: in
     Colours that are decoded one by one show something else: decoding and blending do not commute.
 
     Args:
-        module: with its weights.
-        light: what the pictures are shown in.
-        steps: of training.
-        sided: whether colours differ between directions.
-        every: of how many rows and columns of pixels one is looked at.
+        module: the backbone with trained weights.
+        light: light of the run's pictures.
+        steps: number of training steps.
+        sided: whether colours depend on the view direction.
+        every: train on each ``every``-th row and column of pixels.
 
     Returns:
         Gaussians of three channels in the files' world, on the module's device.
@@ -91,7 +91,7 @@ def plain(module: Splat, light: Light, steps: int, sided: bool = True, every: in
 
 @torch.no_grad()
 def first_colors(module: Splat, light: Light) -> Float[Tensor, "n 3"]:
-    """Each Gaussian's own colour, decoded and lit: the mean of what the training cameras see."""
+    """Each Gaussian's colour, decoded and lit, as the mean over the directions of the training cameras."""
     centres, floor = module.c2w[:: math.ceil(len(module.c2w) / MAX_CAMERAS), :, 3], -module.low / module.range
     seen = (module.low + module.range * colors_seen(module.gaussians, at, module.degrees, floor) for at in centres)
     return sum(light.apply(module.decode(latent)) for latent in seen) / len(centres)
@@ -99,13 +99,13 @@ def first_colors(module: Splat, light: Light) -> Float[Tensor, "n 3"]:
 
 @torch.no_grad()
 def lit_view(module: PosedBackbone, views: Views, index: int, light: Light, every: int = 1) -> Float[Tensor, "h w 3"]:
-    """The run's own picture of a view, lit; of one of so many rows and columns of pixels."""
+    """Render the run's picture of a view, lit; only each ``every``-th row and column."""
     with full_float32(module.device):
         return light.apply(module.render_view(views, index, every)["rgb"])
 
 
 def render_splats(gaussians: Gaussians, camera: Camera, behind: Float[Tensor, " 3"]) -> Float[Tensor, "3 h w"]:
-    """Render Gaussians of three channels before a colour."""
+    """Render Gaussians of three channels in front of a background colour ``behind``."""
     degrees, shift = math.isqrt(gaussians.shN.shape[1] // 3 + 1), torch.zeros_like(gaussians.means[:, :2])
     image, left = picture(gaussians, camera, shift, degrees, 0.0, 0)
     return image + left * behind[:, None, None]
@@ -113,7 +113,7 @@ def render_splats(gaussians: Gaussians, camera: Camera, behind: Float[Tensor, " 
 
 @torch.no_grad()
 def likeness(module: Splat, gaussians: Gaussians, light: Light) -> float:
-    """The mean PSNR of what Gaussians of the files' world show of the test views, against the run's own pictures."""
+    """Mean PSNR of the test views rendered from exported Gaussians, against the run's own pictures."""
     views, behind = module.scene.test, module.constant_background()[0]
     pictures = (render_splats(gaussians, camera, behind).permute(1, 2, 0) for camera in cameras_in_files(module, views))
     scores = [psnr(each.clamp(0, 1), lit_view(module, views, index, light)) for index, each in enumerate(pictures)]
@@ -153,7 +153,7 @@ def write_splats(path: Path, gaussians: Gaussians) -> None:
 
 
 def read_splats(path: Path) -> Gaussians:
-    """Read what :func:`write_splats` wrote."""
+    """Read Gaussians from a file that :func:`write_splats` wrote."""
     body = path.read_bytes().partition(b"end_header\n")[2]
     table = torch.from_numpy(np.frombuffer(body, "<f4").reshape(-1, len(PROPERTIES)).astype(np.float32))
     means, _, sh0, shN, opacities, scales, quats = table.split([3, 3, *PROPERTY_GROUPS.values()], 1)

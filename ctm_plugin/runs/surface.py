@@ -23,7 +23,7 @@ POINTS = 1 << 15
 MAX_DEPTH_STEP = 0.1
 """Largest relative difference of neighbouring pixels' depths on one surface."""
 NORMAL_OFFSET = 1e-3
-"""Half the distance of the differences that a cloud's normals are made of, as a share of the distance to the camera."""
+"""Half the step of the central differences for a cloud's normals, as a share of the distance to the camera."""
 
 
 class Surface(NamedTuple):
@@ -42,14 +42,14 @@ class Surface(NamedTuple):
 
 
 def stopped(module: PosedBackbone, points: Float[Tensor, "m 3"], length: Tensor | float) -> Float[Tensor, " m"]:
-    """Opacity ``[M]`` of a length of what lies at points ``[M, 3]``: ``1 - exp(-density length)``."""
+    """Opacity ``[M]`` of a ``length`` of matter with the density at points ``[M, 3]``: ``1 - exp(-density length)``."""
     axis = torch.tensor([0.0, 0.0, -1.0], device=points.device).expand_as(points)
     density = torch.cat([module.query(*part)[0] for part in zip(points.split(POINTS), axis.split(POINTS), strict=True)])
     return -torch.expm1(-density * length)
 
 
 def normals(module: PosedBackbone, points: Float[Tensor, "m 3"], half: Tensor | float) -> Float[Tensor, "m 3"]:
-    """Against the density's gradient at points ``[M, 3]``, by central differences over twice ``half``; 0 without one.
+    """Normals at points ``[M, 3]``: against the density's gradient, by central differences over twice ``half``.
 
     The gradient is of :func:`stopped`, whose direction is the density's.
     """
@@ -64,7 +64,7 @@ def normals(module: PosedBackbone, points: Float[Tensor, "m 3"], half: Tensor | 
 
 
 def spanned(points: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:
-    """Normals of the surface between a picture's neighbouring points, either way round; 0 of those without any."""
+    """Normals, of either sign, of the surface through a picture's neighbouring points; 0 without neighbours."""
     around = F.pad(points.permute(2, 0, 1)[None], (1, 1, 1, 1), mode="replicate")[0]
     across, down = around[:, 1:-1, 2:] - around[:, 1:-1, :-2], around[:, 2:, 1:-1] - around[:, :-2, 1:-1]
     return F.normalize(torch.linalg.cross(across, down, dim=0), dim=0).permute(1, 2, 0)
@@ -72,17 +72,17 @@ def spanned(points: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:
 
 @torch.no_grad()
 def cloud(module: PosedBackbone, max_points: int, opaque: float) -> Surface:
-    """End points of the training views' rays, in the colours that they have there.
+    """Cloud of the points where the training views' rays end, with the colours rendered there.
 
-    Normals are the density's, or of a backbone that does not tell it what neighbouring rays' ends say.
+    Normals are the density's; of a backbone without density, those of the surface through neighbouring end points.
 
     Args:
-        module: with its weights.
-        most: points, over all views, which are thinned evenly.
+        module: the backbone with trained weights.
+        max_points: most points over all views, which are thinned evenly.
         opaque: share of a ray's light that matter must stop.
 
     Raises:
-        CTMError: nothing does.
+        CTMError: no ray meets such matter.
     """
     scene, views, tells = module.scene, module.scene.train, type(module).query is not PosedBackbone.query
     every = max(1, math.ceil(math.sqrt(len(views) * views.height * views.width / max_points)))
@@ -118,15 +118,15 @@ def cloud(module: PosedBackbone, max_points: int, opaque: float) -> Surface:
 
 @torch.no_grad()
 def mesh(module: PosedBackbone, cells: int, opaque: float) -> Surface:
-    """Marching cubes round what stops light (Lorensen and Cline, SIGGRAPH 1987), closed where its box ends.
+    """Mesh by marching cubes round opaque matter (Lorensen and Cline, SIGGRAPH 1987), closed at the box's faces.
 
     Args:
         module: with its weights.
-        cells: along the longest side of the box.
-        opaque: share of the light that what lies on the surface would stop if it were ``LAYER_THICKNESS`` thick.
+        cells: number of cells along the longest side of the box.
+        opaque: share of light that matter at the surface would stop in a layer ``LAYER_THICKNESS`` thick.
 
     Raises:
-        CTMError: there is no such surface, or the backbone does not tell densities.
+        CTMError: there is no such surface, or the backbone has no density.
     """
     low, high = module.world_box().to(module.device)
     longest = float((high - low).max())

@@ -1,4 +1,4 @@
-"""Runs of a sweep that may have been begun before."""
+"""Runs of a sweep, which may have been begun in an earlier call."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from ctm_plugin.show.console import print_line
 
 
 def go_on(config: Config, sweep: Path, folder: Path, capture: Capture | None = None) -> dict[str, Any]:
-    """Do a sweep's run that may have been begun before: finished, it stays as it is; interrupted, it goes on.
+    """Do a sweep's run: if it was begun earlier, a finished one stays as it is, an interrupted one is resumed.
 
-    Runs are known by their configuration, so that their numbers may differ from the unfinished sweep's.
+    Runs are recognised by their configuration, so that their numbers in the sweep may differ from earlier.
 
     Args:
         config, sweep: the resolved configuration, and the sweep's folder.
-        folder: where the run goes if it is new; a folder next to it where that is taken.
-        capture: of its data, where they have been read.
+        folder: folder of a new run; a folder next to it where that is taken.
+        capture: the capture of the run's data, where it has been read already.
 
     Returns:
-        What ``metrics.json`` holds.
+        The content of ``metrics.json``.
     """
     for run in sorted(path.parent for path in sweep.glob(f"*/{CONFIG}")):
         same = False
@@ -54,7 +54,7 @@ def finished(sweep: Path) -> list[tuple[Config, dict[str, Any]]]:
 
 
 def same_run(saved: Config, config: Config) -> bool:
-    """Tell whether a saved configuration is this one; it holds the precision that ``auto`` came to."""
+    """Tell whether a saved configuration equals a new one; the saved one holds the precision that ``auto`` came to."""
     trainer = dict(config["trainer"])
     if trainer.get("precision") == "auto":
         trainer["precision"] = saved["trainer"].get("precision")

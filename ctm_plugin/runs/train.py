@@ -1,4 +1,4 @@
-"""One run: build, fit, render and score, write it all down."""
+"""Training of a run, new or resumed: build, fit, render, score, and write its files."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ from ctm_plugin.settings.build import Config
 from ctm_plugin.show.console import print_summary, quieten
 
 Tell = Callable[[dict[str, Any], Path], None]
-"""Prints what ``metrics.json`` holds of the run in a directory."""
+"""Function that prints a run's scores, given the content of ``metrics.json`` and the run's directory."""
 MAX_EXPOSURE_RATIO = 1.2
 """Largest ratio of two pictures' light that counts as one exposure: a quarter of a stop."""
 MIN_TRAINING = 20_000 * 5e-4
@@ -60,9 +60,9 @@ MIN_TRAINING = 20_000 * 5e-4
 SCORED_SECTIONS = ("dataset", "backbone", "ctm", "color_space", "appearance", "loss")
 """Sections of the configuration that scores depend on."""
 NOTED_KEYS = {f"{group}{key}" for group in SCORED_SECTIONS for key in ("", ".name", ".preset")}
-"""Keys of these that the line about a run names otherwise."""
+"""Keys of the scored sections that a run's hyperparameters have under shorter names."""
 NOTED_KEYS |= {"dataset.exposure", "dataset.root", "dataset.image", "loss.kind"}
-"""What has a shorter name, or follows from the data set's name."""
+"""Further keys with a shorter name, or that follow from the data set's name."""
 
 
 def train(config: Config, run: Path, tell: Tell = print_summary, capture: Capture | None = None) -> dict[str, Any]:
@@ -72,7 +72,7 @@ def train(config: Config, run: Path, tell: Tell = print_summary, capture: Captur
         config: the resolved configuration, plain containers.
         run: a new directory, or one that holds no run.
         tell: prints what was found.
-        capture: of its data, where they have been read.
+        capture: the capture of the run's data, where it has been read already.
 
     Returns:
         What ``metrics.json`` holds.
@@ -99,10 +99,10 @@ def resume(run: Path, tell: Tell = print_summary, root: str | None = None) -> di
     Args:
         run: its directory.
         tell: prints what was found.
-        root: the folder of its data from here on, where it is not found from the run or what is in it has changed.
+        root: the folder of its data from now on, where the old one is not found or its content has changed.
 
     Raises:
-        CTMError: the directory is no run, its data are nowhere or have changed, or its checkpoint cannot be used.
+        CTMError: the directory is no run, its data are missing or changed, or its checkpoint cannot be used.
     """
     config = load_config(run)
     name = next((name for name in (LAST, PREVIOUS) if (run / name).exists()), None)
@@ -129,7 +129,7 @@ def command(run: Path, settings: RunConfig) -> None:
 
 
 def warn_of_short_run(config: Config, parts: Parts) -> None:
-    """Warn where a learned transform will not be ready in time."""
+    """Warn where a training is too short for a learned transform without pre-training."""
     steps, training = parts.backbone.total_steps, parts.backbone.transform.learning
     unready = config["ctm"].get("init") == "random" and not training.pretrain_steps
     if unready and steps * training.lr < MIN_TRAINING:
@@ -141,7 +141,7 @@ def warn_of_short_run(config: Config, parts: Parts) -> None:
 
 
 def warn_of_exposures(config: Config, parts: Parts) -> None:
-    """Warn where pictures were not all exposed alike, as their EXIF says, and nothing tells them apart."""
+    """Warn where the pictures' exposures differ by EXIF, and no ``appearance`` accounts for it."""
     exposures = parts.scene.train.exposures if parts.backbone.posed else None
     if exposures is None or config["appearance"]["name"] != "none":
         return
@@ -155,9 +155,9 @@ def warn_of_exposures(config: Config, parts: Parts) -> None:
 
 
 def hyperparameters(config: Config, module: Backbone, result: Mapping[str, Any]) -> dict[str, Any]:
-    """Collect what sets a run apart from others, by name, then all settings of the parts that its scores depend on.
+    """Collect a run's main hyperparameters by short names, then all settings that its scores depend on.
 
-    Without CTM its weights and frequencies are 0, so that runs without it have a place on every axis.
+    Without CTM, its weights and frequencies are given as 0, so that such runs have a place on every axis.
     """
     exposure = getattr(getattr(module, "scene", None), "exposure", None)
     values = {name: result[name] for name in ("dataset", "backbone", "ctm", "color_space", "appearance", "steps")}

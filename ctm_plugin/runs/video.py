@@ -1,4 +1,4 @@
-"""A video of a run."""
+"""Films of a run along a camera path, as GIF, WebP or H.264."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def film(run: Path, posed: LoadedRun, settings: VideoConfig) -> Path:
     """Write a film, see :func:`render`.
 
     Returns:
-        Its file.
+        The film's file.
     """
     module, scene = posed.module, posed.module.scene
     path = settings.path or ("orbit" if turn(scene.train.c2w.cpu().double().numpy()) >= SURROUND_DEGREES else "capture")
@@ -81,10 +81,10 @@ def film(run: Path, posed: LoadedRun, settings: VideoConfig) -> Path:
 
 
 def check_new(files: Iterable[Path]) -> None:
-    """Refuse to replace files that are there.
+    """Refuse to overwrite existing files.
 
     Raises:
-        ConfigError: one is.
+        ConfigError: a file exists.
     """
     for file in files:
         if file.exists():
@@ -92,8 +92,8 @@ def check_new(files: Iterable[Path]) -> None:
 
 
 def film_cameras(scene: Scene, path: str | KeyFrames, frames: int) -> list[Views]:
-    """The cameras of a path, a view each: with lens and size of the largest test view, the first of several, or a
-    pinhole of the field of view that key frames say.
+    """The cameras of a path, a view each, of the largest test view's size: with its lens, or as a pinhole of the key
+    frames' field of view.
     """
     test, own = scene.test, scene.test.largest
     lens = test.intrinsics[own : own + 1]
@@ -116,26 +116,26 @@ def film_cameras(scene: Scene, path: str | KeyFrames, frames: int) -> list[Views
 
 
 def rendered(module: PosedBackbone, cameras: Iterable[Views]) -> Iterator[dict[str, Tensor]]:
-    """Views as :meth:`~PosedBackbone.render_view` gives them with one ray a pixel, on the CPU."""
+    """Render cameras in turn by :meth:`~PosedBackbone.render_view`, one ray a pixel; results on the CPU."""
     for views in cameras:
         with torch.no_grad():
             yield {name: value.float().cpu() for name, value in module.render_view(views, 0, rays=1).items()}
 
 
 def frame(*pictures: Float[Tensor, "h w 3"]) -> np.ndarray:
-    """Pictures side by side, bytes ``[H, W, 3]``, of even sides, as video wants them."""
+    """A film's frame, bytes ``[H, W, 3]``: pictures side by side, cut to even sides, as video codecs need."""
     joined = (beside(*pictures).clamp(0, 1) * 255).round().byte().numpy()
     return np.pad(joined, ((0, len(joined) % 2), (0, joined.shape[1] % 2), (0, 0)), mode="edge")
 
 
 def write_video(path: Path, frames: Sequence[np.ndarray], fps: Number) -> None:
-    """Write frames, see :func:`encoded`."""
+    """Write frames ``[F, H, W, 3]`` as a video file, see :func:`encoded`."""
     with replacing(path) as beside_path:
         beside_path.write_bytes(encoded(np.stack(frames), path.suffix, fps))
 
 
 def encoded(frames: UInt8[np.ndarray, "f h w 3"], ending: str, fps: Number) -> bytes:
-    """A film's frames as a file: GIF, WebP or H.264, as the ending says."""
+    """Encode a film's frames as GIF, WebP or H.264, by the file name's ``ending``."""
     mp4 = {"plugin": "FFMPEG", "fps": fps, "macro_block_size": 2, "output_params": FFMPEG_BT709}
     return iio.imwrite(
         "<bytes>", frames, extension=ending, **(mp4 if ending == ".mp4" else {"duration": 1000 / fps, "loop": 0})

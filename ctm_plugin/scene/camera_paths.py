@@ -25,9 +25,9 @@ MAX_DETOUR = 1.5
 """Cameras keep their order of capture if the path through them is at most this much longer than from each to the
 nearest left."""
 SMOOTHING = 0.1
-"""Share of the path over which it is averaged."""
+"""Standard deviation of the Gaussian weights that smooth a path, as a share of its length."""
 DEPTH_CYCLES = 0.5
-"""Oscillations along the axis in a turn round."""
+"""Oscillations of a spiral along the viewing axis in one turn."""
 LIGHT_KEYS = ("light", "contrast", "saturation")
 """Keys of the light in which a path was made, as on the command line."""
 EASE = 0.15
@@ -57,7 +57,7 @@ def spiral(views: Views, near: Number, far: Number, frames: int = 120, turns: in
         turns: times round.
 
     Returns:
-        ``[F, 3, 4]`` camera to world, OpenGL axes; so do the others.
+        ``[F, 3, 4]`` camera to world, OpenGL axes; so do the other paths.
     """
     c2w = views.c2w.cpu().double().numpy()
     mean = mean_pose(c2w)
@@ -73,7 +73,7 @@ def spiral(views: Views, near: Number, far: Number, frames: int = 120, turns: in
 
 
 def walk(centres: Float64[np.ndarray, "n 3"]) -> Int64[np.ndarray, " n"]:
-    """The order in which to visit cameras: their own, or from one to the nearest left where that is far shorter."""
+    """The order in which a path visits cameras: of capture, or always to the nearest unvisited where far shorter."""
     apart = np.linalg.norm(centres[:, None] - centres, axis=-1)
     order = [int(apart.sum(1).argmax())]
     while len(order) < len(centres):
@@ -86,9 +86,9 @@ def walk(centres: Float64[np.ndarray, "n 3"]) -> Int64[np.ndarray, " n"]:
 
 
 def capture(views: Views, frames: int = 120) -> Float32[Tensor, "f 3 4"]:
-    """Smoothly past where the photographs were taken, slowly at both ends.
+    """Path that passes smoothly by the places where the photographs were taken, slowly at both ends.
 
-    At s of the way along the line through all cameras (:func:`walk`) stands the mean of them, each weighed by
+    At a share s of the line through all cameras (:func:`walk`) stands their mean, each camera weighed by
     ``exp(-(s - s_i)^2 / (2 0.1^2))``; so the path stays among the cameras. It is walked through as :func:`eased` says.
 
     Args:
@@ -106,7 +106,7 @@ def capture(views: Views, frames: int = 120) -> Float32[Tensor, "f 3 4"]:
 
 
 def eased(times: Float64[np.ndarray, " n"]) -> Float64[np.ndarray, " n"]:
-    """How much of the way lies behind at times in [0, 1]: the speed rises evenly over :data:`EASE`, stays, and falls.
+    """Share of a path that is done at times in [0, 1]: the speed rises evenly over :data:`EASE`, stays, and falls.
 
     With e = EASE, ``s(t) = t^2 / (2 e (1 - e))`` up to e, ``(t - e / 2) / (1 - e)`` in the middle, ``1 - s(1 - t)`` at
     the end.
@@ -124,7 +124,7 @@ def _lengths(centres: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, " n"]:
 
 
 def _means(c2w: np.ndarray, along: np.ndarray, places: np.ndarray) -> np.ndarray:
-    """Means of matrices, ``[P, 3, 4]``, weighed by how near to each of the places on the way they are."""
+    """Means of camera matrices, ``[P, 3, 4]``, weighed by their nearness along the path to each of P places."""
     weights = np.exp(-0.5 * ((places[:, None] - along) / SMOOTHING) ** 2)
     return np.einsum("pn,nij->pij", weights / weights.sum(1, keepdims=True), c2w)
 
@@ -136,9 +136,9 @@ def mean_up(views: Views) -> Float64[np.ndarray, " 3"]:
 
 
 def orbit(views: Views, frames: int = 120) -> Float32[Tensor, "f 3 4"]:
-    """Once round what all cameras look at, at their mean height above it and their mean distance from its axis.
+    """Circle round what all cameras look at, at their mean height above it and their mean distance from its axis.
 
-    The path is round :func:`looked_at` and :func:`mean_up`; it begins in the first camera's direction and turns
+    Its centre is :func:`looked_at`, its axis :func:`mean_up`; it begins in the first camera's direction and turns
     anticlockwise, seen from above.
 
     Args:
@@ -161,13 +161,13 @@ def orbit(views: Views, frames: int = 120) -> Float32[Tensor, "f 3 4"]:
 
 @dataclass(frozen=True, eq=False)
 class KeyFrames:
-    """N cameras, as long from one to the next.
+    """N cameras of a path, equally far apart in time.
 
     Attributes:
         c2w: ``[N, 3, 4]`` camera to world, OpenGL axes.
         fov: ``[N]`` vertical fields of view in radians.
         closed: whether the path goes on from the last to the first.
-        lit: what its pictures were seen in: light in stops, contrast, saturation; ``None`` where that is not said.
+        lit: light in which the path was made: stops, contrast, saturation; ``None`` where that is not known.
     """
 
     c2w: Float64[np.ndarray, "n 3 4"]
@@ -203,7 +203,7 @@ class KeyFrames:
         return torch.from_numpy(poses).float(), torch.from_numpy(PchipInterpolator(keys, fov)(at)).float()
 
     def content(self) -> dict[str, Any]:
-        """What a file of them holds, as :func:`ctm_plugin.data.readers.key_frames.read_key_frames` reads it."""
+        """Content of a key-frame file, as :func:`ctm_plugin.data.readers.key_frames.read_key_frames` reads it."""
         keys = [
             {"camera_to_world": pose.tolist(), "fov": math.degrees(fov)}
             for pose, fov in zip(self.c2w, self.fov, strict=True)

@@ -25,7 +25,7 @@ def edge_points(extents: Tensor, points: int = 33) -> tuple[Tensor, Tensor]:
 
 
 def edge_rays(views: Views, points: int = 33) -> Rays:
-    """``points`` x ``points`` rays over what counts of each image, its edges included, view after view."""
+    """``points`` x ``points`` rays over the part of each image that counts, its edges included, view after view."""
     x, y = edge_points(views.extents, points)
     each = x.shape[1]
     return camera_rays(
@@ -78,8 +78,8 @@ def view_counts(points: Float[Tensor, "p 3"], views: Views, near: float) -> tupl
 def visual_hull(points: Float[Tensor, "p 3"], views: Views, radius: float) -> Bool[Tensor, " p"]:
     """Tell round which points, up to ``radius``, the pictures leave room for something (Laurentini, 1994).
 
-    All that see the point have a pixel there whose alpha is not 0, or one that does not count; points that none sees
-    are left out. What a lens stretches is not looked out for.
+    All cameras that see the point have a pixel there whose alpha is not 0, or a masked one. Points that no camera sees
+    are left out. The ball's stretching by a lens is ignored.
 
     Args:
         views: pictures with alpha.
@@ -108,14 +108,14 @@ def visual_hull(points: Float[Tensor, "p 3"], views: Views, radius: float) -> Bo
 
 
 def reach(square: Float[Tensor, " p"], depth: Float[Tensor, " p"], radius: float) -> Float[Tensor, " p"]:
-    """Largest distance of a ball's picture from its middle, in focal lengths: away from the axis.
+    """Largest distance in a picture from a ball's middle to its outline, in focal lengths: away from the axis.
 
     ``tan(a + b) - tan a``, a the middle's angle from the axis and ``sin b = radius / distance``; infinite where the
     ball reaches past the camera.
 
     Args:
-        square: of the middle's distance from the camera.
-        depth: along the axis, more than 0.
+        square: squared distance from the camera to the ball's middle.
+        depth: depth of the ball's middle along the camera's axis, > 0.
     """
     steep = (square / depth.square() - 1).clamp_min(0).sqrt()
     wide = radius / (square - radius**2).clamp_min(0).sqrt()
@@ -124,7 +124,7 @@ def reach(square: Float[Tensor, " p"], depth: Float[Tensor, " p"], radius: float
 
 
 class ProjectedPoints(NamedTuple):
-    """Points in a picture: ``[P]`` columns and rows in pixels, depths along its axis, and whether it sees them."""
+    """Points projected into a view: ``[P]`` columns and rows in pixels, depths, and whether the view sees them."""
 
     column: Tensor
     row: Tensor
@@ -153,7 +153,7 @@ def projected(points: Float[Tensor, "p 3"], views: Views, view: int) -> Projecte
 
 
 def camera_ball(views: Views, near: float) -> tuple[Float[Tensor, " 3"], float]:
-    """Centre and radius of the ball that a scene without bounds is about: of all its cameras.
+    """Centre and radius of the ball round all cameras, outside which an unbounded scene is contracted.
 
     Round the point where their axes meet, else round their mean; no smaller than ``near``.
     """

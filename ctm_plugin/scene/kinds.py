@@ -1,4 +1,4 @@
-"""Names for how the cameras of a scene stand, and for what rays show that hit nothing."""
+"""Names for the arrangement of a scene's cameras, and for the background of rays that hit nothing."""
 
 from typing import Literal, get_args
 

@@ -56,14 +56,14 @@ def check_pose(c2w: Float64[np.ndarray, "4 4"], source: Path, where: str) -> Non
 
 
 def is_field_of_view(angle: Number) -> bool:
-    """Whether ``angle`` is one in radians, in (0, pi) with a margin of ``MIN_ANGLE``."""
+    """Whether ``angle`` is a field of view in radians: in (0, pi) with a margin of ``MIN_ANGLE``."""
     return MIN_ANGLE <= angle <= math.pi - MIN_ANGLE
 
 
 def facing(
     back: Float64[np.ndarray, "*n 3"], up: Sequence[float] | np.ndarray, eye: Float64[np.ndarray, "*n 3"]
 ) -> Float64[np.ndarray, "*n 3 4"]:
-    """Turn cameras at ``eye`` against ``back``, of unit length, ``up`` upwards: ``[..., 3]`` to ``[..., 3, 4]``."""
+    """Make poses ``[..., 3, 4]`` of cameras at ``eye`` that look along -``back``, of unit length, ``up`` upwards."""
     right = np.cross(up, back)
     right = right / np.linalg.norm(right, axis=-1, keepdims=True)
     return np.stack([right, np.cross(back, right), back, eye], axis=-1)
@@ -84,8 +84,8 @@ class Similarity(NamedTuple):
     """Map from one world to another: ``p -> scale turn p + shift``, and how well cameras agree on it.
 
     Attributes:
-        off: the largest distance between cameras, as a part of the spread of all (root mean square).
-        angle: the largest angle between cameras, in radians.
+        off: largest distance between matched cameras, as a share of the spread of all (root mean square).
+        angle: largest angle between matched cameras, in radians.
     """
 
     scale: float
@@ -95,15 +95,15 @@ class Similarity(NamedTuple):
     angle: float
 
     def moved(self, points: Float64[np.ndarray, "p 3"]) -> Float64[np.ndarray, "p 3"]:
-        """Take points of the one world into the other."""
+        """Map points of the source world into the target world."""
         return self.scale * points @ self.turn.T + self.shift
 
     def of_poses(self, c2w: Float64[np.ndarray, "n 3 4"]) -> Float64[np.ndarray, "n 3 4"]:
-        """Take cameras of the one world into the other."""
+        """Map cameras of the source world into the target world."""
         return np.concatenate([self.turn @ c2w[:, :, :3], self.moved(c2w[:, :, 3])[..., None]], axis=2)
 
     def inverse(self) -> Similarity:
-        """The way back."""
+        """The similarity from the target world back to the source world."""
         shift = -self.shift @ self.turn / self.scale
         return self._replace(scale=1 / self.scale, turn=self.turn.T, shift=shift)
 

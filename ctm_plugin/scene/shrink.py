@@ -14,9 +14,9 @@ FULL_COVERAGE = 1 - 1e-5
 
 
 def shrink(image: Float32[Tensor, "h w c"], height: int, width: int) -> Float32[Tensor, "h2 w2 c"]:
-    """The mean over each larger pixel's area; with alpha, of premultiplied colour: ``mean(a c) / mean(a)``.
+    """Downscale a picture by means over each larger pixel's area; with alpha, of premultiplied colour.
 
-    ``[H, W, C]``, straight alpha in and out; colour is 0 where alpha is 0.
+    Colour is ``mean(a c) / mean(a)``: ``[H, W, C]`` with straight alpha in and out; 0 where alpha is 0.
     """
     if image.shape[:2] == (height, width):
         return image
@@ -41,7 +41,7 @@ def area(image: Float32[Tensor, "h w c"], height: int, width: int) -> Float32[Te
 
 
 def area_of_rows(image: Float32[Tensor, "h w c"], height: int) -> Float32[Tensor, "h2 w c"]:
-    """Means over ``height`` equal parts of the first side."""
+    """Means over ``height`` equal parts of a picture's rows."""
     count = len(image)
     edges = torch.arange(height + 1, dtype=torch.float64) * count / height
     low, high, first = edges[:-1], edges[1:], edges[:-1].long()
@@ -54,12 +54,12 @@ def area_of_rows(image: Float32[Tensor, "h w c"], height: int) -> Float32[Tensor
 
 
 def shrink_mask(mask: Bool[Tensor, "h w"], height: int, width: int) -> Bool[Tensor, "h2 w2"]:
-    """Larger pixels that count: those that lie whole in what counts."""
+    """Downscale a mask: a larger pixel counts where all pixels that it covers count."""
     return area(mask[..., None].float(), height, width)[..., 0] > FULL_COVERAGE
 
 
 def shrink_depth(depth: Float[Tensor, "h w"], height: int, width: int) -> Float[Tensor, "h2 w2"]:
-    """The depth ``[H, W]`` nearest to each larger pixel's centre: averages over an edge would lie on no surface.
+    """Downscale depth ``[H, W]`` to the value nearest each larger pixel's centre: means over edges lie on no surface.
 
     Where a centre lies between pixels, the one below right is taken.
     """

@@ -36,8 +36,8 @@ class Views:
         distortion: ``[N, 5]`` (k1, k2, p1, p2, k3) of the lenses, see :func:`ctm_plugin.rays.cameras.distort`; ``None``
             for pinholes.
         mask: ``[N, H, W]``, which pixels count: the others are neither trained on nor scored; ``None``: all do.
-        pictured: ``[N]``, of which test views there is a picture; the others are rendered and not scored, their
-            ``images`` are black. ``None``: of all.
+        pictured: ``[N]``, whether a test view has a photograph; the others are rendered and not scored, their
+            ``images`` are black. ``None``: all have one.
         lit: ``[N, H, W, 3]``, the same views in normal light, 8 bits: only references for lit pictures, which nothing
             is trained on or fitted to. ``None``: there are none.
         exposures: ``[N]``, the light that each training picture took by its EXIF, up to one factor; NaN where it does
@@ -71,7 +71,7 @@ class Views:
 
     @cached_property
     def extents(self) -> Int64[Tensor, "n 2"]:
-        """``[N, 2]`` width and height, from the upper left corner, of what counts of each picture."""
+        """Width and height ``[N, 2]`` of the part of each picture that counts, from its upper left corner."""
         sides = torch.tensor([self.width, self.height])
         if self.mask is None:
             return sides.expand(len(self), 2)
@@ -103,7 +103,7 @@ class Points:
 
     Attributes:
         positions: ``[P, 3]`` in the scene's world.
-        point, view: ``[T]``: training view ``view[i]`` sees point ``point[i]``; both are empty where nobody tells.
+        point, view: ``[T]``: training view ``view[i]`` sees point ``point[i]``; both are empty where that is unknown.
     """
 
     positions: Float32[Tensor, "p 3"]
@@ -117,15 +117,15 @@ class Scene:
 
     Attributes:
         name: the data set's name in tables.
-        train, test: its views.
+        train, test: training and test views.
         near, far: bounds along the (unit) ray directions, in scene units.
         geometry: ``bounded`` (cameras around an object), ``forward`` (NDC is valid) or ``unbounded``.
         background: what rays that hit nothing show, see docs/method.md.
         exposure: light relative to a normal exposure where it is known, else ``None``.
         background_level: how bright random backgrounds are, see :class:`ctm_plugin.data.settings.PhotoConfig`.
-        world: how the files' world lies in this one; ``None``: it is this one.
-        points: of the files' reconstruction; ``None``: there are none.
-        light: gain, contrast and saturation that pictures of it are shown in, where there are none to tell.
+        world: similarity from the files' world to the scene's; ``None``: the two are the same.
+        points: surface points of the files' reconstruction; ``None``: there are none.
+        light: light in which the scene's pictures are displayed, where there are no photographs to find it from.
     """
 
     name: str

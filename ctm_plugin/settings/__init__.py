@@ -1,1 +1,1 @@
-"""From names and plain values to checked settings."""
+"""Settings: registries of names, checked dataclasses of plain values, and the command line's verbs."""

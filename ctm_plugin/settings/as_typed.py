@@ -19,14 +19,14 @@ from ctm_plugin.errors import CTMError
 from ctm_plugin.settings.registry import PRESET_SETTINGS, REGISTRIES, load
 
 HYDRA_FOLDERS = ("hydra.run.dir", "hydra.sweep.dir", "hydra.sweep.subdir")
-"""Keys of Hydra's own folders, which it does not sweep."""
+"""Keys of the folders that Hydra writes to; Hydra does not sweep over their values."""
 HYDRA_VALUES = re.compile(r"null|(?P<quote>['\"]).*(?P=quote)|(choice|glob|shuffle|sort|tag|str)\(.*\)", re.DOTALL)
 """Pattern of values that Hydra reads itself, unless a file has such a name."""
 
 
 @functools.cache
 def grammar() -> OverridesParser:
-    """Hydra's, in which every ``key=value`` is read."""
+    """Parser of Hydra's grammar, which reads every ``key=value``."""
     return OverridesParser.create()
 
 
@@ -38,7 +38,7 @@ def is_sweep(arguments: Iterable[str]) -> bool:
 def as_typed(argument: str, sweep: bool) -> str:
     """Quote the value of a ``key=value`` whose key holds text, so that Hydra takes it for no number, list or the like.
 
-    A comma stands between values where ``sweep`` or where each of them is there, but not in the name of what is there.
+    Commas separate values if ``sweep`` or if all are existing files, but not within an existing file's name.
 
     Example:
         >>> as_typed("dataset.root=cap (1)", sweep=False), as_typed("dataset.root=1e5,it's", sweep=True)
@@ -55,7 +55,7 @@ def as_typed(argument: str, sweep: bool) -> str:
 
 
 def values_of(text: str) -> Iterator[str]:
-    """Split at commas, but for those in the names of what is there."""
+    """Split a value at commas, but for those in names of files and folders that exist."""
     if HYDRA_VALUES.fullmatch(text):
         yield text
         return
@@ -67,7 +67,7 @@ def values_of(text: str) -> Iterator[str]:
 
 
 def bare(text: str) -> list[str]:
-    """What a value names, without the quotes of Hydra's grammar; several where it has a choice of them."""
+    """Read a value without the quotes of Hydra's grammar: the texts it stands for, several for a sweep's choice."""
     if not HYDRA_VALUES.fullmatch(text) or _is_there(text):
         return [text]
     value = grammar().parse_override(f"key={text}").value()
@@ -89,7 +89,7 @@ def _is_there(text: str) -> bool:
 
 
 def _texts(section: str) -> dict[str, bool]:
-    """The dotted keys of a section that hold text, under all choices that it has, and whether it may be a path."""
+    """Dotted keys of a section, under all its choices, whose values are text, and whether that may be a path."""
     registry, keys = REGISTRIES.get(section), {}
     for name in registry.names() if registry else [section] * (section in PRESET_SETTINGS):
         with suppress(CTMError):  # raised when it is asked for

@@ -22,17 +22,17 @@ SECTIONS = (
 )  # fmt: skip
 """Sections of a resolved configuration."""
 NO_WORDS, YES_WORDS = ("none", "off", "no", "null", "false", "0"), ("on", "yes", "true", "1")
-"""Words that choose nothing, and words that choose the plain one."""
+"""Words that switch a group off, and words that stand for its plain choice."""
 TYPES = {int: "an integer", float: "a number", bool: "true or false", str: "text", type(None): "null"}
 TYPES |= {tuple: "a list", list: "a list", dict: "a mapping"}
 T = TypeVar("T")
 Node = Any
-"""A ``DictConfig``; as an annotation that class makes beartype warn."""
+"""Type of a configuration's ``DictConfig``, as ``Any`` because beartype warns of that class."""
 
 
 def _by_geometry(bounded: Any, other: Any, unbounded: Any = None, *, _parent_: Node) -> Any:
-    """``${by_geometry:A,B,C}``: A where the group's ``geometry`` is bounded or not known, C, if given, where it is
-    unbounded, else B.
+    """Resolve ``${by_geometry:A,B,C}``: A where the group's ``geometry`` is bounded or not known, C, if given, where it
+    is unbounded, else B.
     """
     if _parent_.geometry in ("bounded", None):
         return bounded
@@ -40,12 +40,12 @@ def _by_geometry(bounded: Any, other: Any, unbounded: Any = None, *, _parent_: N
 
 
 def _by_budget(quick: Any, standard: Any, *, _root_: Node) -> Any:
-    """``${by_budget:A,B}``: B where the budget is standard, else A."""
+    """Resolve ``${by_budget:A,B}``: B where the trainer's budget is standard, else A."""
     return standard if OmegaConf.select(_root_, "trainer.budget") == "standard" else quick
 
 
 def _scene(*, _root_: Node) -> str:
-    """``${scene:}``: the name of the data set's scene or folder, or of the choice where it has none."""
+    """Resolve ``${scene:}``: the name of the data set's scene or folder, or of the data set where it has none."""
     node = _root_.get("dataset") or {}
     scene, root, name = (
         None if OmegaConf.is_missing(node, key) else node.get(key) for key in ("scene", "root", "name")
@@ -65,7 +65,7 @@ def build(settings: type[T], node: Mapping[str, Any], key: str, also: Iterable[s
         settings: the dataclass; its ``__post_init__`` checks the ranges.
         node: values by field name; fields with defaults may be left out.
         key: where ``node`` stands in the configuration, for messages; empty: at the top.
-        also: further keys that stand there, which an unknown one may be meant for.
+        also: further keys that stand there, for the guess what an unknown key was meant for.
 
     Raises:
         ConfigError: on an unknown key (with the known ones), a missing one, or a value of another type.
@@ -94,7 +94,7 @@ def pairs(arguments: Iterable[str]) -> dict[str, str]:
     """Read the ``key=value`` arguments of a command line.
 
     Raises:
-        CTMError: one has no value, or a key is given twice.
+        CTMError: an argument has no value, or a key is given twice.
     """
     values: dict[str, str] = {}
     for argument in arguments:
@@ -108,11 +108,11 @@ def pairs(arguments: Iterable[str]) -> dict[str, str]:
 
 
 def unknown_key(key: str, known: Iterable[str], everywhere: Iterable[str] = ()) -> ConfigError:
-    """Make the error for a key that does not exist, with the one that was meant where that can be guessed.
+    """Make the error for a key that does not exist, with a guess which known key was meant.
 
     Args:
         key: dotted.
-        known: the names that stand in its place.
+        known: the names that are valid in its place.
         everywhere: dotted keys of all of a configuration: the same name may stand elsewhere.
     """
     names, (above, dot, name) = sorted(known), key.rpartition(".")
@@ -123,20 +123,20 @@ def unknown_key(key: str, known: Iterable[str], everywhere: Iterable[str] = ()) 
 
 
 def unknown_choice(group: str, choice: str, known: Sequence[str]) -> ConfigError:
-    """Make the error for a choice that a group does not have, with the one that was meant likewise."""
+    """Make the error for a choice that a group does not have, with a guess which known choice was meant."""
     word = choice.lower()
     meant = [name for name in known for words in (NO_WORDS, YES_WORDS) if name in words and word in words]
     return ConfigError(group, choice, f"one of {', '.join(known)}{asked(meant or near_to(choice, known))}")
 
 
 def near_to(name: str, known: Iterable[str]) -> list[str]:
-    """Find the name among the ``known`` that a mistyped one is for; or none."""
+    """Find the known name, if any, that a mistyped name resembles."""
     names = {each.lower(): each for each in known}
     return [names[each] for each in get_close_matches(name.lower(), names, 1, 0.65) if names[each] != name]
 
 
 def asked(meant: Sequence[str]) -> str:
-    """Word the end of an error: whether it was one of these that was meant."""
+    """Word the question at an error's end: did the user mean one of these names?"""
     return f"; did you mean {' or '.join(meant)}?" if meant else ""
 
 
@@ -145,7 +145,7 @@ def _below(key: str, name: str) -> str:
 
 
 def _type_of(settings: type, full_key: str) -> str:
-    """Word what a dotted key may hold, or an item ``[i]`` of its list."""
+    """Describe the type that a dotted key, or an item ``[i]`` of its list, may hold."""
     hint: Any = settings
     for part in full_key.split("."):
         name, *item = part.split("[")
@@ -165,21 +165,21 @@ def _known(settings: type, full_key: str) -> list[str]:
 
 @functools.cache
 def _schema(settings: type) -> Node:
-    """A dataclass's fields with their types and defaults, to be merged into a copy."""
+    """A dataclass as OmegaConf's structured node, with types and defaults; copy it before merging."""
     schema = OmegaConf.structured(settings)
     _make_writable(schema)
     return schema
 
 
 def _make_writable(node: Node) -> None:
-    """Frozen dataclasses make read-only nodes, which could not be merged into."""
+    """Make a node of frozen dataclasses writable, at all levels, so that values can be merged into it."""
     OmegaConf.set_readonly(node, False)
     for child in _groups(node).values():
         _make_writable(child)
 
 
 def _check_groups(schema: Node, node: Mapping[str, Any], key: str) -> None:
-    """A single value where a dataclass stands, or a mapping for a list; OmegaConf would not say where."""
+    """Refuse a single value in a dataclass's place, or a mapping in a list's; OmegaConf would not name the key."""
     for name in schema:
         if isinstance(schema._get_node(name), ListConfig) and isinstance(node.get(name), Mapping):
             raise ConfigError(_below(key, name), node[name], "a list")
@@ -201,7 +201,7 @@ def _groups(node: Node) -> dict[str, Node]:
 
 
 def _instance(node: Node, key: str) -> Any:
-    """The dataclass that a node stands for; its lists become tuples, as a frozen dataclass should have.
+    """Make a node's dataclass; lists become tuples, as a frozen dataclass should have.
 
     Raises:
         ConfigError: a list of plain values holds something else, which OmegaConf lets pass.

@@ -37,7 +37,7 @@ HYDRA_FLAGS = shlex.split("""-m --multirun -r --run -c --cfg -p --package --reso
     --config-path -cn --config-name --hydra-help""")
 """Hydra's own flags, which may have a value after them."""
 BARE_FLAGS = shlex.split("-m --multirun -r --run -c --cfg -i --info")
-"""Those of them of which one may be given."""
+"""Hydra's flags of which at most one may be given."""
 
 
 class UsageError(CTMError):
@@ -45,17 +45,17 @@ class UsageError(CTMError):
 
 
 class Verb(NamedTuple):
-    """A command.
+    """A verb of the command line: its form, its settings and its function.
 
     Attributes:
-        summary: a line on it.
-        words: what stands before its settings; ``...`` at the end: one or several; in brackets: or none.
+        summary: what the verb does, in a line.
+        words: names of the words before its settings; ``...`` at the end: one or several; in brackets: or none.
         entry: ``module:function``, imported when it is asked for. The function is given the paths, checked
             ``settings``, if it has a parameter of that name, and what is left as ``others``.
         kind: ``module:dataclass`` of its settings.
-        others: whose keys are taken besides, unchecked: ``module:dataclass``, or those of a run, ``TRAINING``.
-        usual: choices that the run has where ``others`` do not say.
-        goes_on: whether the same command goes on where it was stopped.
+        others: ``module:dataclass`` whose keys are accepted too, unchecked; ``TRAINING``: the keys of a run.
+        usual: choices of the run unless ``others`` give them.
+        goes_on: whether the same command, given again, resumes where it was stopped.
     """
 
     summary: str
@@ -111,11 +111,11 @@ VERBS = {
 }  # fmt: skip
 VERBS_OF_OTHERS = Registry("command", "ctm_plugin.verbs", {})
 EXAMPLE_VERBS = {"scenes": "docs/examples/ctm_scenes"}
-"""Verbs of examples, and where these are in the checkout."""
+"""Verbs of example packages, and the folder of each in a checkout."""
 
 
 def names() -> list[str]:
-    """List all verbs: ours, those of installed packages, and those of examples that are not installed."""
+    """List the names of all verbs: built in, of installed packages, and of examples that are not installed."""
     return [*VERBS, *sorted({*VERBS_OF_OTHERS.names(), *EXAMPLE_VERBS} - VERBS.keys())]
 
 
@@ -143,7 +143,7 @@ def run(name: str, arguments: Sequence[str], check: Callable[[Sequence[str]], No
 
     Args:
         name, arguments: the command line.
-        check: refuses what is mistyped of a run's choices and keys.
+        check: raises an error for mistyped choices and keys of a run.
 
     Raises:
         UsageError: there is no such verb, words are missing or too many, or there are flags.
@@ -200,7 +200,7 @@ def _run(name: str, verb: Verb, arguments: Sequence[str], check: Callable[[Seque
 
 
 def _is_own(key: str, known: Sequence[str]) -> bool:
-    """Tell whether a key is a verb's, if mistyped, and not the run's."""
+    """Tell whether a key, perhaps mistyped, belongs to the verb and not to the run."""
     return key in known or bool(near_to(key, known))
 
 
@@ -211,7 +211,7 @@ def form(name: str, verb: Verb) -> str:
 
 
 def explained(verb: Verb, code: str = "") -> tuple[str, list[tuple[str, str, str]]]:
-    """Read what a verb with an entry does (:func:`plain`), and name, default and meaning of each of its settings."""
+    """Read a verb's description (:func:`plain`), and the name, default and meaning of each of its settings."""
     rows = described(load(verb.kind)) + (described(load(verb.others)) if ":" in verb.others else [])
     return plain(said_by(verb.entry), code), rows
 
@@ -236,7 +236,7 @@ def check_form(arguments: Sequence[str]) -> None:
 
 
 def print_verbs() -> None:
-    """Print what a command line can be, and a line on each verb."""
+    """Print the usage of the command line, and a line on each verb."""
     print(USAGE)
     _print_rows([(name, _summary(name)) for name in names()])
 
@@ -255,9 +255,9 @@ def described(kind: type) -> list[tuple[str, str, str]]:
 
 
 def _runs(words: Sequence[str], verb: Verb) -> Iterator[Path]:
-    """The runs that words name: of a folder of runs the newest, or all where a verb takes several.
+    """Find the runs that words name: of a folder of runs the newest, or all where a verb takes several.
 
-    Reports look through folders themselves, and tell what they leave out.
+    Reports search folders themselves, and name the runs that they leave out.
     """
     runs_of = load("ctm_plugin.runs.rundir:runs_of")
 

@@ -16,13 +16,13 @@ from ctm_plugin.settings.registry import METRICS_OF_OTHERS, REGISTRIES
 
 
 def plain(docstring: str, code: str = "") -> str:
-    """What a docstring tells users, without its sections of arguments and errors; ``code`` goes round names in it."""
+    """A docstring for users, without its sections of arguments and errors; ``code`` is put round names in it."""
     text = re.split(r"\n\n(?:Args|Attributes|Returns|Raises):", docstring)[0]
     return re.sub(r":\w+:`~?(?:\w+\.)*(\w+)`", rf"{code}\1{code}", text).replace("``", code)
 
 
 def names(conf: Path, group: str) -> list[str]:
-    """Find the names of a group's choices: its files, and what its registry has."""
+    """Find the names of a group's choices, out of its files and its registry."""
     stems = {path.stem for path in (conf / group).glob("*.yaml")}
     if registry := REGISTRIES.get(group):
         stems |= {*registry.others(), *registry.added, *(() if group == "callbacks" else registry.ours)}
@@ -30,7 +30,7 @@ def names(conf: Path, group: str) -> list[str]:
 
 
 def choices(conf: Path, group: str) -> dict[str, str]:
-    """Tell a line on each choice of a group: the first comment of its file, or what its registry says."""
+    """Describe each choice of a group in a line: the first comment of its file, or its class's docstring."""
     lines = {}
     for name in names(conf, group):
         path = conf / group / f"{name}.yaml"
@@ -70,7 +70,7 @@ def print_names(console: Console, conf: Path, groups: tuple[str, ...]) -> None:
 
 
 def leaves(node: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, Any]]:
-    """Go through dotted keys and values that are no mappings."""
+    """Iterate over the dotted keys and values of a nested mapping's leaves."""
     for key, value in node.items():
         if isinstance(value, Mapping):
             yield from leaves(value, f"{above}{key}.")

@@ -74,14 +74,14 @@ class Registry:
         self.added: dict[str, Any] = {}
 
     def others(self) -> dict[str, Any]:  # where a package (MLflow) imports importlib_metadata, its EntryPoint
-        """Find the entry points of installed packages; they cannot take a name of ours."""
+        """Find the entry points of other installed packages, without those that have a built-in name."""
         return {entry.name: entry for entry in entry_points(group=self.group) if entry.name not in self.ours}
 
     def names(self) -> list[str]:
         return sorted({*self.ours, *self.added, *self.others()})
 
     def settings(self, name: str) -> type:
-        """Find the dataclass of the settings that one has; of ours, the module that it stands in is imported.
+        """Find the settings' dataclass of a registered name; of a built-in name the dataclass's module is imported.
 
         Raises:
             CTMError: see :meth:`get`.
@@ -92,7 +92,7 @@ class Registry:
         return getattr(thing, "Config", thing)
 
     def about(self, name: str) -> str:
-        """Read what one of ours says of itself, without importing it; or whose package another's is."""
+        """Read the docstring of a built-in class, without importing it; of other classes name the package."""
         if name in self.ours:
             own, module = self.ours[name], self.ours[name].partition(":")[0]
             settings = config_of(own).removeprefix(NOTHING)
@@ -103,7 +103,7 @@ class Registry:
         return f"from {entry.dist.name}" if entry.dist else "from another package"
 
     def docstring(self, name: str) -> str:
-        """Read the whole of what one says of itself, of another package's too, which is imported for it."""
+        """Read the whole docstring of a registered class; another package's class is imported for it."""
         if name in self.ours:
             return self.about(name)
         thing = self.get(name)
@@ -111,7 +111,7 @@ class Registry:
         return "" if text.startswith(f"{thing.__name__}(") else text  # a dataclass's own, its signature
 
     def register(self, name: str, thing: Any) -> None:
-        """Add something from a running program, without a package.
+        """Register a class under a name from a running program, without an entry point.
 
         Raises:
             CTMError: if the name is taken.
@@ -124,7 +124,7 @@ class Registry:
         """Import what is registered under a name.
 
         Raises:
-            UnknownNameError: nothing is; the message lists what is known.
+            UnknownNameError: nothing is registered under the name; the message lists the known names.
             CTMError: another package's entry point cannot be imported.
         """
         if name in self.added:
@@ -212,13 +212,13 @@ PRESET_SETTINGS = {
 }
 """Dataclasses of the groups whose choices differ only in values."""
 NOTHING = "ctm_plugin.settings.setting:Nothing"
-"""Dataclass of what has no settings."""
+"""Dataclass for choices without settings."""
 CTM_SETTINGS = "ctm_plugin.color.settings:TransformTraining"
 """Dataclass of the settings that all choices of ``ctm`` share."""
 
 
 def load(entry: str) -> Any:
-    """Import what stands for ``module:name``."""
+    """Import the object that ``module:name`` stands for."""
     module, _, name = entry.partition(":")
     return getattr(import_module(module), name)
 

@@ -22,7 +22,7 @@ RULES = ("least", "most", "above", "below", "choices")
 
 
 class Allowed(NamedTuple):
-    """What a value may be: one of ``choices``, or a number in a range, whose ends count or not."""
+    """Allowed values of a setting: one of ``choices``, or a number in a range, with or without its ends."""
 
     integer: bool
     null: bool
@@ -42,7 +42,7 @@ class Allowed(NamedTuple):
         return above and (value < high if self.open_high or high == math.inf else value <= high)
 
     def __str__(self) -> str:
-        """Word it, as an error does: ``an integer, 0 to 3``, ``one of a, b``, ``a number in (0, 1], scene or null``."""
+        """Word this for an error: ``an integer, 0 to 3``, ``one of a, b``, ``a number in (0, 1], scene or null``."""
         words = [str(each).lower() if isinstance(each, bool) else str(each) for each in self.choices]
         words += ["null"] * self.null
         if self.low is None:
@@ -61,7 +61,7 @@ class Allowed(NamedTuple):
 
 
 def setting(default: Any, meaning: str, *, composed: str | None = None, **allowed: Any) -> Any:
-    """Make a dataclass's field with its meaning, and what it may be.
+    """Make a dataclass's field with its default, meaning and allowed values.
 
     Args:
         default: a value that cannot be changed, or ``REQUIRED``.
@@ -109,7 +109,7 @@ class Settings:
                 raise self.fault(name, str(allowed))
 
     def fault(self, name: str, expected: str) -> ConfigError:
-        """Make the error for a value that cannot be used."""
+        """Make the error for a field's value that cannot be used."""
         value = getattr(self, name)
         key = f"{self.section}.{name}" if self.section else name
         return ConfigError(key, list(value) if isinstance(value, tuple) else value, expected)
@@ -122,7 +122,7 @@ class Nothing(Settings):
 
 @functools.cache
 def rules(settings: type) -> dict[str, Allowed]:
-    """Find what the keys of a dataclass may be, where they say so."""
+    """Find the allowed values of a dataclass's dotted keys that restrict them."""
     hints, allowed = get_type_hints(settings), {}
     for each in fields(settings):
         if given := _said(settings, each.name, "allowed"):
@@ -138,9 +138,9 @@ def rules(settings: type) -> dict[str, Allowed]:
 
 @functools.cache
 def defaults(settings: type) -> dict[str, Any]:
-    """Lay a dataclass out as a YAML file with all its keys has it; those that must be given are ``???``, and first.
+    """Lay a dataclass's defaults out as in a YAML file with all keys; required keys come first and are ``???``.
 
-    One dictionary for all who ask, not to be changed.
+    The dictionary is cached: callers must not change it.
     """
     node = OmegaConf.to_container(OmegaConf.structured(settings))
     node |= {each.name: each.metadata["composed"] for each in fields(settings) if "composed" in each.metadata}
@@ -148,7 +148,7 @@ def defaults(settings: type) -> dict[str, Any]:
 
 
 def meanings(settings: type) -> dict[str, str]:
-    """Tell what each key of a dataclass means, by dotted name; a field that does not say has the words of a base's."""
+    """Tell the meaning of each key of a dataclass, by dotted name; a field without one has that of its base's field."""
     texts = {}
     for each in fields(settings):
         meaning = _said(settings, each.name, "meaning") or ""
@@ -164,7 +164,7 @@ def keys(settings: type) -> list[str]:
 
 
 def _said(settings: type, name: str, what: str) -> Any:
-    """What a field's own metadata say, or those of the nearest base that has the field and says it."""
+    """Read an entry of a field's metadata, or of the same field in the nearest base that has the entry."""
     for kind in settings.__mro__:
         same: Field | None = getattr(kind, "__dataclass_fields__", {}).get(name)
         if same is not None and what in same.metadata:

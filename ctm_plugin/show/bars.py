@@ -14,7 +14,7 @@ from rich.progress import BarColumn, Progress, ProgressColumn, TextColumn, TimeE
 
 T = TypeVar("T")
 Update = Callable[..., None]
-"""Called with how many are done, a word on them, and the seconds left where they are known."""
+"""Function called with the number of items done, a word on them, and the seconds left where they are known."""
 SMOOTHING_S = 20.0
 """Seconds over which a new guess of the end replaces an old one."""
 
@@ -25,13 +25,13 @@ def error_console() -> Console:
 
 
 class Whole:
-    """One bar over several things, each of which has its part of the whole.
+    """One progress bar over several tasks, each of which has its part of the whole.
 
     Args:
-        parts: seconds that each is to take, by what :func:`bar` calls it. Others change nothing.
+        parts: planned seconds of each task, by its name in :func:`bar`. Tasks of other names do not move the bar.
 
-    What is left of a part goes from what was planned to what has been measured as the part goes on; later parts are
-    taken for as long as planned.
+    The time left of a part goes from the planned to the measured time as the part goes on; later parts count with
+    their planned time.
     """
 
     def __init__(self, parts: Mapping[str, float]):
@@ -64,7 +64,7 @@ _WHOLE: list[Whole] = []
 
 @contextmanager
 def whole(parts: Mapping[str, float]) -> Iterator[None]:
-    """Show one bar for all that is done within, see :class:`Whole`."""
+    """Context with one progress bar over all tasks within, see :class:`Whole`."""
     _WHOLE.append(Whole(parts))
     try:
         with _WHOLE[-1].progress:
@@ -75,7 +75,7 @@ def whole(parts: Mapping[str, float]) -> Iterator[None]:
 
 @contextmanager
 def bar(what: str, total: int, begun: int = 0, console: Console | None = None) -> Iterator[Update]:
-    """Show how many of ``total`` are done, with a word on the last."""
+    """Context with a progress bar of ``total`` items; it gives the function that updates the bar."""
     if _WHOLE:
         over = _WHOLE[-1]
         yield lambda number, last="", left=None: over.update(what, number / max(total, 1), last, left)
@@ -94,7 +94,7 @@ def say(text: str) -> None:
 
 
 def tracked(items: Iterable[T], what: str, total: int | None = None) -> Iterator[T]:
-    """Show how many items have been."""
+    """Iterate over items under a progress bar."""
     count = total if total is not None else len(items) if isinstance(items, Sequence | range) else 0
     with bar(what, count) as done:
         for number, item in enumerate(items, 1):

@@ -30,15 +30,15 @@ UP = torch.linalg.cross(NEAR, RIGHT)
 def cube_picture(
     transform: ColorTransform, colors: Float[Tensor, "n 3"], light: Light = AS_IS
 ) -> Float[Tensor, "h w 3"]:
-    """Four cubes. Above: a lattice of RGB where it is, and where its latents are, each point in its own colour.
+    """Draw four cubes. Above: a lattice of RGB colours at their RGB and at their latents, each point in its own colour.
     Below: the same for some of the scene's colours, whose dots are lit, as dark ones would not be seen.
 
-    Where k is not 3, latents lie at what :func:`ctm_plugin.show.pictures.latent_picture` makes of them.
+    Where k is not 3, latents lie at the colours that :func:`ctm_plugin.show.pictures.latent_picture` gives them.
 
     Args:
         transform: may be on any device.
         colors: sRGB in [0, 1], on the transform's device.
-        light: of the scene.
+        light: light in which the scene's colours are displayed.
     """
     steps = torch.linspace(0, 1, LATTICE_POINTS, device=colors.device)
     lattice = torch.cartesian_prod(steps, steps, steps)
@@ -51,7 +51,7 @@ def cube_picture(
 
 
 def dots(places: Float[Tensor, "n 3"], colors: Float[Tensor, "n 3"]) -> Float[Tensor, "h w 3"]:
-    """Dots in the unit cube, seen from outside, the nearer ones in front."""
+    """Draw coloured dots in the unit cube, seen from outside, the nearer ones in front."""
     canvas = Image.new("RGB", (PICTURE_SIDE, PICTURE_SIDE), (96, 96, 96))
     pen = ImageDraw.Draw(canvas)
     corners = torch.tensor(list(itertools.product((0.0, 1.0), repeat=3)))
@@ -66,6 +66,6 @@ def dots(places: Float[Tensor, "n 3"], colors: Float[Tensor, "n 3"]) -> Float[Te
 
 
 def _seen(points: Float[Tensor, "n 3"]) -> Float[Tensor, "n 2"]:
-    """Positions in the picture, in pixels, of points of the unit cube."""
+    """Project points of the unit cube to pixel positions in the picture."""
     centred = points - 0.5
     return PICTURE_SIDE * (0.5 + 0.6 * torch.stack([centred @ RIGHT, -(centred @ UP)], dim=1))

@@ -25,18 +25,18 @@ PATHS = {
 
 
 def output_console() -> Console:
-    """Open standard output: a terminal's width, or lines as long as they are."""
+    """Open standard output as a console, of a terminal's width, or of unlimited width elsewhere."""
     console = Console()
     return console if console.is_terminal else Console(width=10_000)
 
 
 def table_for(console: Console, **settings: Any) -> Table:
-    """Begin a table with lines on a terminal, columns of plain text elsewhere."""
+    """Make an empty table, with ruled lines on a terminal, as columns of plain text elsewhere."""
     return Table(box=box.HEAVY_HEAD if console.is_terminal else None, **settings)
 
 
 def texts(metrics: dict[str, Any], place: str) -> dict[str, str]:
-    """Write the scores that a person reads at a place (see :func:`told_at`) as text, by their names."""
+    """Format the scores that are shown at a place (see :func:`told_at`) as text, by their names."""
     alike = metrics.get("appearance") == "none"
     entries = {name: metric for name, metric in told_at(place).items() if not (alike and metric.differing)}
     return {name: metric.text(metrics[name]) for name, metric in entries.items() if metrics.get(name) is not None}
@@ -48,13 +48,13 @@ def print_next(verb: str, path: Path) -> None:
 
 
 def print_file(before: str, path: Path) -> None:
-    """Print where a file is, on a terminal as a link that opens it."""
+    """Print a file's path, on a terminal as a link that opens it."""
     link = Style(link=path.resolve().as_uri())
     output_console().print(Text.assemble(before, (str(path), link)), soft_wrap=True)
 
 
 def print_summary(metrics: dict[str, Any], folder: Path, run: Path | None = None) -> None:
-    """Print the scores of a run, what it took, and where everything is, if not in the run's own directory."""
+    """Print a run's scores, its time and memory, and the folder of its files, if that is not the run's own."""
     console = output_console()
     table = table_for(console, show_header=False)
     for name, text in texts(metrics, "run").items():
@@ -83,7 +83,7 @@ def print_line(metrics: dict[str, Any], folder: Path, before: str = "") -> None:
 
 
 def print_sweep(runs: Sequence[tuple[str, dict[str, Any] | None]], folder: Path) -> None:
-    """Print a line a run: what sets it apart, and its scores; ``None`` where it failed."""
+    """Print a line a run of a sweep: the settings that set it apart, and its scores; ``None`` where it failed."""
     console = output_console()
     rows = [(what, None if metrics is None else texts(metrics, "sweep")) for what, metrics in runs]
     shown = [name for name in told_at("sweep") if any(scores and name in scores for _, scores in rows)]

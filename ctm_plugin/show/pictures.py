@@ -14,19 +14,19 @@ from ctm_plugin.files import replacing
 
 
 def depth_picture(depth: Float[Tensor, "h w"], near: float, far: float) -> Float[Tensor, "h w 3"]:
-    """Distances from near (bright) to far (dark)."""
+    """Picture of distances, from near (bright) to far (dark)."""
     scaled = ((far - depth) / (far - near)).clamp(0, 1)
     return torch.from_numpy(matplotlib.colormaps["inferno"](scaled.cpu().numpy())[..., :3]).float()
 
 
 def error_picture(error: Float[Tensor, "h w"], largest: float) -> Float[Tensor, "h w 3"]:
-    """Errors from 0 (dark) to ``largest`` (bright)."""
+    """Picture of errors, from 0 (dark) to ``largest`` (bright)."""
     scaled = (error / max(largest, 1e-12)).clamp(0, 1)
     return torch.from_numpy(matplotlib.colormaps["viridis"](scaled.cpu().numpy())[..., :3]).float()
 
 
 def latent_picture(latent: Float[Tensor, "*n k"]) -> Float[Tensor, "*n 3"]:
-    """Latents as colours: as they are for k = 3, grey for 1, an empty blue for 2, three principal components else."""
+    """Colours for latents: unchanged for k = 3, grey for 1, an empty blue for 2, three principal components else."""
     channels = latent.shape[-1]
     latent = latent.cpu()
     if channels == 1:

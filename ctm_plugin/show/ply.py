@@ -26,9 +26,9 @@ def write_ply(
     """Write vertices with normals and colours, whole or not at all.
 
     Args:
-        path: of the file.
+        path: the file to write.
         points, normals: in any unit; normals of unit length.
-        colors: sRGB.
+        colors: sRGB of the vertices.
         faces: triples of vertices, counter-clockwise from outside; ``None``: a cloud of points.
     """
     vertices = np.empty(len(points), VERTEX_TYPE)

@@ -14,8 +14,8 @@ from ctm_plugin.show.pictures import beside, error_picture, latent_picture
 
 @dataclass
 class Snapshot:
-    """Pictures ``[H, W, 3]`` and latents ``[..., k]`` by the names that loggers have for them, scores by those of
-    :data:`METRICS`; on the CPU."""
+    """Pictures ``[H, W, 3]`` and latents ``[..., k]`` of a field in training, by their tags in loggers, and scores by
+    their names in :data:`METRICS`; on the CPU."""
 
     pictures: dict[str, Tensor] = field(default_factory=dict)
     latents: dict[str, Tensor] = field(default_factory=dict)
@@ -26,13 +26,13 @@ def compared(
     render: Tensor, target: Tensor | None, latent: Tensor, exposure: float | None, light: Light,
     mask: Tensor | None = None,
 ) -> Snapshot:  # fmt: skip
-    """A rendering next to its target, as all backbones that render pictures show it.
+    """Make the snapshot of a rendering and its target, for all backbones that render pictures.
 
     Args:
         render, target: sRGB ``[H, W, 3]`` in [0, 1]; ``None`` where it is not known.
         latent: ``[H, W, k]`` that ``render`` was decoded from.
         exposure: light relative to a normal exposure, ``None`` where it is not known.
-        light: what the scene is shown to people in.
+        light: light in which the scene is displayed.
         mask: which pixels are scored, ``[H, W]``; ``None``: all are.
 
     Returns:

@@ -23,11 +23,11 @@ URL.createObjectURL = (of) => of.type?.startsWith("text/javascript") ? "" : made
 
 
 class Spots(NamedTuple):
-    """Gaussians with one colour each from all sides.
+    """Gaussians whose colours do not depend on the view direction.
 
     Attributes:
         centres: ``[N, 3]``.
-        axes: ``[N, 3, 3]``, a standard deviation along each column.
+        axes: ``[N, 3, 3]``, principal axes as columns, each of the length of its standard deviation.
         colors: ``[N, 3]`` sRGB in [0, 1].
         opacities: ``[N, 1]`` in [0, 1].
     """
@@ -39,7 +39,7 @@ class Spots(NamedTuple):
 
 
 class Start(NamedTuple):
-    """First camera of a walk: the eye, what it looks at, which way is up, and the vertical field of view in radians."""
+    """First camera of a walk: position, point looked at, up direction, and vertical field of view in radians."""
 
     eye: Float[np.ndarray, " 3"]
     ahead: Float[np.ndarray, " 3"]
@@ -50,7 +50,7 @@ class Start(NamedTuple):
 def walk(spots: Spots, start: Start) -> str:
     """Make a page of HTML that needs nothing else: viser's viewer, with the scene in it.
 
-    The server that viser wants for it has ended before it knows the scene, so nobody can ask it.
+    The server that viser needs to make the page ends before it has the scene, so that nobody can reach the scene.
     """
     import viser
 

@@ -1,1 +1,1 @@
-"""Gaussian splats (Kerbl et al., SIGGRAPH 2023): projection, rasterisation, where they begin, how they grow."""
+"""Gaussian splats (Kerbl et al., SIGGRAPH 2023): projection, rasterisation, initialisation, density control."""

@@ -20,8 +20,8 @@ MIN_ALPHA = 1 / 255
 MAX_ALPHA = 0.99
 """Largest alpha of one Gaussian (3DGS)."""
 FRAME_MARGINS = 1.3, 1.05
-"""Limits of a projection's slopes, in frames: of pinholes, and of lenses, whose polynomial folds further out. Beyond
-them the projection is linear."""
+"""Limits of |x / z| and |y / z|, as multiples of the picture's edge: for pinholes, and for lenses, whose polynomial
+folds further out. Beyond them the projection is linear."""
 
 
 class Gaussians(NamedTuple):
@@ -37,9 +37,9 @@ class Gaussians(NamedTuple):
     """Quaternions (w, x, y, z) of any length > 0."""
     opacities: Float[Tensor, "n 1"]
     sh0: Float[Tensor, "n k"]
-    """Coefficients of the constant harmonic."""
+    """Colour coefficients of the constant spherical harmonic."""
     shN: Float[Tensor, "n rest"]
-    """Coefficients of the B - 1 others, ``[N, (B - 1) k]``, channels of one harmonic after those of another."""
+    """Colour coefficients of the B - 1 other harmonics, ``[N, (B - 1) k]``, channels of one harmonic after another."""
 
 
 class Camera(NamedTuple):
@@ -47,12 +47,12 @@ class Camera(NamedTuple):
 
     Attributes:
         turn: rotation from world to camera.
-        centre: of the camera, in the world.
+        centre: the camera's centre in the world.
         lens: (fx, fy, cx, cy) in pixels, the first pixel's centre at (0.5, 0.5).
         distortion: (k1, k2, p1, p2, k3); zeros of a pinhole.
         reach: largest |x / z| and |y / z| where the projection follows the lens.
         near: distance of the near plane along z.
-        height, width: of the picture in pixels.
+        height, width: size of the picture in pixels.
     """
 
     turn: Float[Tensor, "3 3"]
@@ -65,7 +65,7 @@ class Camera(NamedTuple):
     width: int
 
     def on(self, device: torch.device) -> Camera:
-        """Move it to a device."""
+        """Give the same camera with its tensors on ``device``."""
         return Camera(*(each.to(device) if isinstance(each, Tensor) else each for each in self))
 
 
@@ -86,10 +86,10 @@ def camera_of(views: Views, index: int, near: float, every: int = 1) -> Camera:
 
 
 class ProjectedGaussians(NamedTuple):
-    """Gaussians on a picture.
+    """Gaussians projected onto a picture.
 
     Attributes:
-        means: ``[N, 2]`` in pixels, x right, y down.
+        means: ``[N, 2]`` projected means in pixels, x right, y down.
         conics: ``[N, 3]`` the inverse covariance's xx, xy and yy.
         opacities: ``[N]``.
         colors: ``[N, k]``.
@@ -140,7 +140,7 @@ def project(gaussians: Gaussians, camera: Camera, shift: Tensor, degrees: int, f
     Args:
         gaussians: N of them.
         camera: pose and lens.
-        shift: ``[N, 2]``, added to the means on the picture; its gradient is theirs.
+        shift: ``[N, 2]`` zeros, added to the projected means, whose gradient it receives.
         degrees, floor: see :func:`colors_seen`.
     """
     local = (gaussians.means - camera.centre) @ camera.turn.T
@@ -182,7 +182,7 @@ def project(gaussians: Gaussians, camera: Camera, shift: Tensor, degrees: int, f
 
 
 def secants(camera: Camera) -> Float[Tensor, "h w"]:
-    """Distance along the ray of each pixel, a unit of depth along the camera's axis."""
+    """Ratio of distance along the ray to depth along the camera's axis, for each pixel."""
     fx, fy, cx, cy = camera.lens
     x = (torch.arange(camera.width, device=fx.device) + 0.5 - cx) / fx
     y = (torch.arange(camera.height, device=fx.device)[:, None] + 0.5 - cy) / fy

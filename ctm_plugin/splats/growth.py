@@ -15,13 +15,13 @@ GROW_SCALE3D = 0.01
 """Standard deviation, in extents of the cameras, from which on a Gaussian is split; smaller ones are duplicated
 (gsplat's ``grow_scale3d``)."""
 MIN_GAUSSIANS = 100
-"""Least number of Gaussians that pruning leaves: a field without any would never learn again."""
+"""Least number of Gaussians that pruning leaves: without Gaussians a field would never learn again."""
 SPLIT_FACTOR = 1.6
 """Ratio of the scale of a Gaussian to that of the two it is split into."""
 
 
 class Change(NamedTuple):
-    """Indices of the Gaussians that stay, and the ones added after them."""
+    """A change of the Gaussians: indices of those that stay, and new ones to append."""
 
     kept: Int[Tensor, " m"]
     added: Gaussians
@@ -43,10 +43,10 @@ def densify(
         gaussians: N of them.
         grad2d: mean length of the gradient of the means on the picture, in halves of its sides.
         grow_grad2d: threshold of ``grad2d``; infinity: only prune.
-        extent: of the cameras, in scene units.
+        extent: extent of the cameras, in scene units.
         cap_max: largest number of Gaussians; the largest ``grad2d`` goes first.
         prune_opa: opacity below which one is pruned.
-        normal: draws from N(0, 1): offsets of the halves of a split one, in its standard deviations.
+        normal: draws from N(0, 1): offsets of the two halves of a split Gaussian, in its standard deviations.
     """
     stays = shows(gaussians, prune_opa)
     grows = stays & (grad2d > grow_grad2d)  # a pruned one would leave its duplicate, NaN and all
@@ -67,7 +67,7 @@ def densify(
 
 
 def shows(gaussians: Gaussians, prune_opa: float) -> Bool[Tensor, " n"]:
-    """Tell which Gaussians are finite and as opaque as ``prune_opa``; if none is, the most opaque ones."""
+    """Tell which Gaussians to keep: those finite and at least as opaque as ``prune_opa``; if none, the most opaque."""
     finite = torch.stack([table.isfinite().all(1) for table in gaussians]).all(0)
     opacities = torch.where(finite, gaussians.opacities[:, 0].sigmoid(), -1.0)
     kept = opacities >= prune_opa

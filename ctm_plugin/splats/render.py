@@ -14,7 +14,7 @@ TILE_SIDE = 16
 PLANE_CHANNELS = 3
 """Number of channels that :func:`with_plane` adds to the colours, for depth."""
 INVERSE_CHANNELS = 1
-"""Number of channels for ``near / z`` after the colours, z the depth along the camera's axis."""
+"""Number of channels after the colours for inverse depth ``near / z``, z along the camera's axis."""
 STRIDES = (1, 4)
 """Pixels from one of the three pixels whose depths :func:`bends` compares to the next."""
 EDGE_WIDTH = 0.03
@@ -48,7 +48,7 @@ def picture(
         camera: pose and lens.
         shift: ``[N, 2]`` zeros, whose gradient is that of the means on the picture, in pixels.
         degrees, floor: see :func:`~ctm_plugin.splats.gaussians.colors_seen`.
-        more: channels after the colours: 0, :data:`PLANE_CHANNELS` (without gradients) or :data:`INVERSE_CHANNELS`.
+        more: number of further channels: 0, :data:`PLANE_CHANNELS` (without gradients) or :data:`INVERSE_CHANNELS`.
 
     Returns:
         ``[k + more, H, W]``, and ``[H, W]``, the transmittance.
@@ -68,7 +68,7 @@ def rasterize(
     means: Tensor, conics: Tensor, opacities: Tensor, extents: Tensor, depths: Tensor, colors: Tensor, width: int,
     height: int,
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
-    """Composite in plain torch, see :func:`picture`: of what :class:`Projected` holds and colours ``[N, c]``."""
+    """Composite :class:`ProjectedGaussians` of colours ``[N, c]`` in plain torch, see :func:`picture`."""
     order = depths.detach().argsort(stable=True)
     means, conics, opacities, extents = (each[order] for each in (means, conics, opacities, extents))
     colors, bands = colors[order], []
@@ -98,7 +98,7 @@ def rasterize(
 def expected_depth(
     image: Float[Tensor, "c h w"], left: Float[Tensor, "h w"], camera: Camera, far: float
 ) -> Float[Tensor, "h w"]:
-    """Distances along the rays out of a picture with depth; light that nothing stops counts as stopped at ``far``."""
+    """Distances along the rays out of a picture's depth channels; light that nothing stops counts as at ``far``."""
     x = torch.arange(camera.width, device=image.device) + (0.5 - camera.width / 2)
     y = torch.arange(camera.height, device=image.device) + (0.5 - camera.height / 2)
     plane = image[-3] + x * image[-2] + y[:, None] * image[-1]
@@ -115,9 +115,9 @@ def bends(
     of the two differences of colour. Large at a fold within one colour, nearly nothing where the picture has an edge.
 
     Args:
-        inverse: of the depth, rendered, in any unit; its gradient is wanted.
-        stopped: the share of the light that made it.
-        colors: of the picture, without gradient; what the scene fills is [0, 1].
+        inverse: rendered inverse depth in any unit, not divided by opacity; it gets a gradient.
+        stopped: opacity of each pixel, the share of light that the Gaussians stop.
+        colors: rendered colours, without gradient; the scene's colours fill [0, 1].
     """
     surface, terms = inverse / stopped.detach().clamp_min(MIN_OPACITY), []
     for axis in (0, 1):

@@ -1,4 +1,4 @@
-"""Coarse to fine: pictures averaged over squares of pixels to begin with, while these are all a step can learn."""
+"""Coarse to fine training: pictures are averaged over squares of pixels at first."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ chair)."""
 
 
 class Stage(NamedTuple):
-    """A part of a schedule.
+    """A stage of the training's schedule, with its downscaling.
 
     Attributes:
-        side: pixels of the squares that become one.
-        until: where in the schedule it ends, as a share of it.
+        side: side in pixels of the squares that are averaged into one pixel.
+        until: end of the stage, as a share of the schedule.
     """
 
     side: int
@@ -38,9 +38,9 @@ class Stage(NamedTuple):
 
 
 def stages(views: Views) -> list[Stage]:
-    """Find how long smaller pictures have something to teach: until ``share ** 0.6`` of the schedule.
+    """Find the stages of smaller pictures: each lasts until ``share ** 0.6`` of the schedule.
 
-    The share is what they hold of all detail, the sum of a picture's amplitudes over its frequencies. An octave, from
+    It is their share of all detail, the sum of a picture's amplitudes over its frequencies. An octave, from
     squares of s to those of 2 s pixels, has ``rms / s`` of it. So smooth scenes stay coarse for long, leaves do not.
     Weighing frequencies so is DashGaussian's idea (Chen et al., CVPR 2025).
     """
@@ -59,7 +59,7 @@ def stages(views: Views) -> list[Stage]:
 
 
 def _counts(views: Views, side: int) -> bool:
-    """Whether each picture has a square of which all counts."""
+    """Whether each picture has a square of ``side`` pixels without masked ones."""
     mask = _masks(views, side)
     return mask is None or bool(mask.flatten(1).any(1).all())
 

@@ -14,10 +14,10 @@ from ctm_plugin.splats.start import SH_C0
 
 
 def pixels_made(gaussians: Gaussians, cameras: Sequence[Camera]) -> Float[Tensor, " n"]:
-    """Pixels that each Gaussian makes in a mean picture: the sum of its ``alpha_i T_i``, see
+    """Contribution in pixels of each Gaussian to a mean picture: the sum of its ``alpha_i T_i``, see
     :func:`~ctm_plugin.splats.render.picture`; 0 where no camera sees it.
 
-    Pictures are linear in colours, so that is the gradient of the sum of a grey one.
+    Pictures are linear in colours: the sum is the gradient of a grey picture's sum in the Gaussian's colour.
     """
     grey = gaussians.sh0.new_zeros(len(gaussians.sh0), 1, requires_grad=True)
     bare = Gaussians(*(table.detach() for table in gaussians))._replace(sh0=grey, shN=grey.new_zeros(len(grey), 0))
@@ -28,7 +28,7 @@ def pixels_made(gaussians: Gaussians, cameras: Sequence[Camera]) -> Float[Tensor
 
 
 def times_seen(places: Float[Tensor, "n 3"], cameras: Sequence[Camera]) -> Int64[Tensor, " n"]:
-    """Number of cameras with each point in their pictures, as pinholes, whether or not something hides it."""
+    """Number of cameras that have each point in their frame, taken as pinholes, occlusion ignored."""
     times = torch.zeros(len(places), dtype=torch.long, device=places.device)
     for camera in cameras:
         x, y, z = ((places - camera.centre) @ camera.turn.T).unbind(1)
@@ -38,9 +38,9 @@ def times_seen(places: Float[Tensor, "n 3"], cameras: Sequence[Camera]) -> Int64
 
 
 def as_wide_as_pixels(gaussians: Gaussians, cameras: Sequence[Camera]) -> Gaussians:
-    """Widen Gaussians by what pictures add to each, as the nearest camera sees it: ``s^2 + 0.3 (d / f)^2``.
+    """Widen Gaussians by 0.3 pixels squared of the nearest camera: ``s^2 + 0.3 (d / f)^2``, d depth, f focal length.
 
-    So that pictures with smaller pixels than those that it was trained on have no gaps.
+    Renderings with smaller pixels than the training pictures' then have no gaps.
     """
     centres = torch.stack([camera.centre for camera in cameras])
     pixels = torch.stack([1 / camera.lens[:2].mean() for camera in cameras])

@@ -1,4 +1,4 @@
-"""Initial Gaussians: at a reconstruction's points, at random points in view where it has few or none."""
+"""Initial Gaussians: at a reconstruction's points, else at random points that training cameras see."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ SH_C0 = 0.28209479177387814
 
 
 def first_places(scene: Scene, count: int, seed: int) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:
-    """Choose where Gaussians begin, and the sRGB colours that training pictures have there.
+    """Choose the initial positions of Gaussians, and the sRGB colours that training pictures have there.
 
     Args:
-        scene: whose ``points`` are taken, with random ones added where they are fewer than 300.
-        count: of random ones.
-        seed: of these.
+        scene: scene whose ``points`` are taken, with random ones added where they are fewer than 300.
+        count: number of random points.
+        seed: seed of the random points.
     """
     points = scene.points
     given = torch.empty(0, 3) if points is None else points.positions
@@ -49,7 +49,7 @@ def first_places(scene: Scene, count: int, seed: int) -> tuple[Float[Tensor, "n 
 def random_places(scene: Scene, count: int, seed: int) -> Float[Tensor, "n 3"]:
     """Draw places between near and far on random pixels' rays that other views see too; inside the hull of an object.
 
-    At most ``count``: of those left, the first.
+    At most ``count`` places are given, the first ones that remain.
     """
     views, draws = scene.train, Draws(seed, 0, stream="places")
     drawn = DRAWS_PER_POINT * count
@@ -69,8 +69,8 @@ def random_places(scene: Scene, count: int, seed: int) -> Float[Tensor, "n 3"]:
 
 
 def colors_of(scene: Scene, places: Float[Tensor, "n 3"], tracked: Tensor) -> Float[Tensor, "n 3"]:
-    """Mean sRGB colours of the training pictures at places: in those that see them by ``tracked`` ``[T, 2]`` (place,
-    view), of places without any there in all that have them in their frame; grey of those in none. Masked pixels do not
+    """Mean sRGB colours of places in the training pictures that see them by ``tracked``, ``[T, 2]`` (place, view).
+    Other places get the mean over all pictures that have them in their frame, or grey. Masked pixels do not
     count.
     """
     views, background = scene.train, torch.full((3,), float(scene.background == "white"))
@@ -92,7 +92,7 @@ def colors_of(scene: Scene, places: Float[Tensor, "n 3"], tracked: Tensor) -> Fl
 
 
 def first_gaussians(places: Float[Tensor, "n 3"], colors: Float[Tensor, "n k"], degree: int) -> Gaussians:
-    """Make round Gaussians at places, each as large as its neighbours are far, in colours as they are seen."""
+    """Make isotropic Gaussians at places, as large as their neighbours' distance, with colours alike from all sides."""
     count, channels = colors.shape
     apart = cKDTree(places.numpy()).query(places.numpy(), min(NEIGHBOURS, max(count - 1, 1)) + 1)[0][:, 1:]
     size = torch.from_numpy(np.sqrt((apart**2).mean(1)).clip(1e-7, 1e7)).float().log()

@@ -1,4 +1,4 @@
-"""The browser's camera as one of ours."""
+"""Conversion between the browser's camera and views, rays and poses."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ MIN_ASPECT = 1e-3
 
 @dataclass(frozen=True)
 class BrowserCamera:
-    """A pinhole whose axis goes through the picture's centre, as viser has it.
+    """The browser's camera in viser: a pinhole whose axis goes through the picture's centre.
 
     Attributes:
         wxyz: camera to world, OpenCV axes, a quaternion of unit length.
-        position: in scene units.
+        position: the camera's centre in scene units.
         fov: vertical field of view in radians, over the whole height.
         aspect: width over height.
     """
@@ -39,13 +39,13 @@ class BrowserCamera:
     aspect: float
 
     def usable(self) -> bool:
-        """Whether these are a camera's numbers: a window without area has aspect 0 or NaN."""
+        """Whether the camera can render: a window without area has aspect 0 or NaN."""
         numbers = all(map(math.isfinite, (*self.wxyz, *self.position))) and any(self.wxyz)
         return numbers and is_field_of_view(self.fov) and MIN_ASPECT <= self.aspect <= 1 / MIN_ASPECT
 
     @classmethod
     def of(cls, c2w: Float[np.ndarray, "3 4"], fov: float, aspect: float = 1.0) -> BrowserCamera:
-        """One of OpenGL axes."""
+        """Make a browser camera from a camera-to-world matrix with OpenGL axes."""
         wxyz = np.roll(Rotation.from_matrix(c2w[:, :3] * OPENCV_TO_OPENGL).as_quat(), 1)
         return cls(tuple(wxyz.tolist()), tuple(c2w[:, 3].tolist()), fov, aspect)
 
@@ -62,28 +62,28 @@ class BrowserCamera:
         return longest, max(1, round(longest * self.aspect))
 
     def views(self, height: int, width: int) -> Views:
-        """A black picture of it. Its edges are those of the field of view at any size: where rounding changed the
-        aspect, pixels are not quite square."""
+        """A black view of this camera. At any size its edges are those of the field of view: where rounding changed
+        the aspect, pixels are not quite square."""
         half = math.tan(self.fov / 2)
         lens = torch.tensor([[width / (2 * half * self.aspect), height / (2 * half), width / 2, height / 2]])
         return Views(torch.zeros(1, height, width, 3, dtype=torch.uint8), self.c2w[None], lens, ("view",))
 
     def rays(self, height: int, width: int) -> Rays:
-        """Through all pixels' centres of its picture, row after row."""
+        """Rays through the centres of all pixels of the camera's picture, row after row."""
         views = self.views(height, width)
         return pixel_rays(views.c2w, views.intrinsics, height, width, torch.arange(height * width))
 
 
 def view_camera(views: Views, index: int) -> BrowserCamera:
-    """A view's camera; of one whose axis misses the picture's centre, or whose lens distorts, the nearest there is."""
+    """The browser camera of a view; principal point and lens distortion are dropped."""
     fov = 2 * math.atan(views.height / (2 * views.intrinsics[index, 1].item()))
     return BrowserCamera.of(views.c2w[index].double().cpu().numpy(), fov, views.width / views.height)
 
 
 def ahead(scene: Scene, c2w: Float[Tensor, "n 3 4"], times: float = 1.0) -> Float64[np.ndarray, "n 3"]:
-    """Points on cameras' axes, as deep as what all cameras look at, or as many times as deep.
+    """Points on cameras' axes at ``times`` the depth of the point that all cameras look at.
 
-    On forward-facing scenes that is where a spiral's cameras look.
+    On forward-facing scenes that point is the focus of the spiral path.
     """
     eyes, forward = c2w.double().cpu().numpy()[..., 3], -c2w.double().cpu().numpy()[..., 2]
     if scene.geometry == "forward":
@@ -93,7 +93,7 @@ def ahead(scene: Scene, c2w: Float[Tensor, "n 3 4"], times: float = 1.0) -> Floa
 
 
 def extent(scene: Scene) -> Float64[np.ndarray, "2 3"]:
-    """Two corners of a box with all training cameras, and what lies before them as deep again as what they look at."""
+    """Two corners of a box round all training cameras and the space before them, to twice the depth looked at."""
     points = np.concatenate([ahead(scene, scene.train.c2w, 0.0), ahead(scene, scene.train.c2w, 2.0)])
     middle, half = (points.max(0) + points.min(0)) / 2, np.ptp(points, axis=0) / 2
     half = np.maximum(half, half.max() / 2)

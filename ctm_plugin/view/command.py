@@ -1,4 +1,4 @@
-"""Look at runs in the browser."""
+"""The verb ``view``: a viewer of runs in the browser."""
 
 from __future__ import annotations
 

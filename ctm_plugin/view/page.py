@@ -1,4 +1,4 @@
-"""A client's page: its controls, its camera, and what it asks for."""
+"""The page of one browser client: its controls, its camera, and its requests for pictures."""
 
 from __future__ import annotations
 
@@ -39,17 +39,17 @@ MAX_SECONDS = 600.0
 
 
 class Page:
-    """Page of one client, from the first test view on.
+    """Page of one browser client; it begins at the first test view.
 
     Args:
-        client: whose.
+        client: viser's handle of the browser client.
         subjects: runs by name.
         views: photographs, the test views' first.
-        light: where the sliders begin.
-        ask: called with what is to be painted.
+        light: initial light of the sliders.
+        ask: function that is called with the look to be painted.
 
     Attributes:
-        here: the view that was gone to last.
+        here: the view that the camera went to last.
     """
 
     def __init__(
@@ -77,7 +77,7 @@ class Page:
         self._place(views[0])
 
     def _picture_controls(self, gui: viser.GuiApi, runs: Sequence[str], light: Light) -> list[viser.GuiInputHandle]:
-        """Controls of the run, its kind of picture, and the picture next to it."""
+        """Make the controls of the run, its kind of picture, and the picture next to it."""
         scene, several = self._scene, len(runs) > 1
         self.run = gui.add_dropdown("run", runs, visible=several)
         self.kind = gui.add_dropdown("picture", tuple(LABELS))
@@ -95,7 +95,7 @@ class Page:
         return [self.run, self.kind, self.stops, self.contrast, self.saturation, self.beside, self.layout, self.split]
 
     def _view_controls(self, client: viser.ClientHandle) -> None:
-        """Views by name; cameras that are gone to when clicked."""
+        """Make the controls that go to a view by name, or by a click on its drawn camera."""
         by_label = {view.label: view for view in self._views}
         self.view = client.gui.add_dropdown("view", tuple(by_label))
         following = client.gui.add_button("next view")
@@ -137,7 +137,7 @@ class Page:
         return [self.size, self.seconds]
 
     def _space_controls(self, client: viser.ClientHandle) -> list[viser.GuiInputHandle]:
-        """Controls of the background, and of a crop box along the world's axes."""
+        """Make the controls of the background, and of a crop box along the world's axes."""
         colour = (255, 255, 255) if self._scene.background == "white" else (0, 0, 0)
         with client.gui.add_folder("background and crop", expand_by_default=False):
             self.background = client.gui.add_rgb("background", colour)
@@ -165,12 +165,12 @@ class Page:
 
     @property
     def limit(self) -> Limit:
-        """The limit that the controls ask for; a number that is just being typed may be beyond its range."""
+        """The limit of size and seconds that the controls ask for, cut to its range while a number is being typed."""
         size, seconds = int(self.size.value), float(self.seconds.value)
         return Limit(min(max(size, SIDES[0]), SIDES[1]), min(max(seconds, 0.1), MAX_SECONDS))
 
     def ask(self) -> None:
-        """Have it painted, and show the controls and marks that mean something now."""
+        """Request the picture of the present look, and show only the controls that apply to it."""
         two = self.beside.value != NOTHING
         self.legend.visible = self.kind.value == "depth"
         self.layout.visible, self.split.visible = two, two and self.layout.value == "slider"
@@ -184,7 +184,7 @@ class Page:
             self._ask(look, self.limit)
 
     def show(self, look: Look, picture: Float[Tensor, "h w 3"], seconds: float) -> None:
-        """Put a picture behind everything, and tell what it is."""
+        """Set a painted picture as the page's background, and describe it in the page."""
         self._levels = to_8_bits(picture).numpy()
         self._client.scene.set_background_image(self._levels, format="png")
         subject, *beside = look.sources
@@ -203,12 +203,12 @@ class Page:
             self._client.send_file_download(name, content, save_immediately=True)
 
     def _place(self, view: PhotographSource) -> None:
-        """Put the camera where a view's is, upright as the scene is."""
+        """Move the browser's camera to a view's camera, with the scene's up direction."""
         self.here = view
         self._aim(view.camera, mean_up(self._scene.train))
 
     def _aim(self, camera: BrowserCamera, up: Float[np.ndarray, " 3"] | None = None) -> None:
-        """Put the camera somewhere, turned as it is or so that this is up."""
+        """Move the browser's camera to ``camera``; ``up``: the new up direction, if given."""
         at = self._client.camera
         with self._client.atomic():
             at.up_direction = camera.c2w[:, 1].double().numpy() if up is None else up

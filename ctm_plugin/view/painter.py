@@ -1,4 +1,4 @@
-"""Pictures for clients that get finer while nobody moves, by one painter for all of them."""
+"""Pictures for all browser clients, from one painter, that get finer while a client's camera rests."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ FIRST_SECONDS = 0.15
 MIN_GROWTH = 1.25
 """Least ratio of a finer picture's side to the last one's, unless it is the finest."""
 ASSUMED_SPEED = 10_000.0
-"""Pixels a second, as long as none are measured."""
+"""Rendering speed in pixels a second, until one is measured."""
 
 
 class Stopped(Exception):
-    """Nobody wants this picture any more."""
+    """Stops the painting of a picture that its client does not want any more."""
 
 
 class Viewpoint(NamedTuple):
@@ -61,19 +61,19 @@ class Look(NamedTuple):
     light: Light = AS_IS
 
     def alike(self, other: Look) -> bool:
-        """Whether the renderings of one do for the other."""
+        """Whether two looks need the same renderings."""
         return self[:3] == other[:3]
 
 
 class Renderings:
-    """Pictures of looks, out of the last renderings where they do: another light needs no new one."""
+    """Cache of the last renderings, which paints looks: a change of only light or kind needs no new rendering."""
 
     def __init__(self) -> None:
         self._render = lru_cache(4)(self._timed)
         self.clear = self._render.cache_clear
 
     def paint(self, look: Look, longest: int, check: Callable[[], None]) -> tuple[Float[Tensor, "h w 3"], float]:
-        """A look's picture, its longer side so many pixels, and the seconds that its renderings took, when they did.
+        """Paint a look with a longer side of ``longest`` pixels; give the picture, and the seconds its rendering took.
 
         ``check`` is called now and then; what it raises goes through.
         """
@@ -111,11 +111,11 @@ class Task:
     """The next picture for a client.
 
     Attributes:
-        size: of the picture, its longer side in pixels.
-        shown: size of the last picture whose renderings do for this look; 0: there is none.
-        first: since the client moved. It is finished even if the client has moved on: a long movement would show
-            nothing.
-        done: there is nothing finer to paint.
+        size: longer side of the picture in pixels.
+        shown: size of the last picture whose renderings suit this look; 0: there is none.
+        first: whether it is the first since the client moved. That one is finished even if the client moves on:
+            a long movement would show nothing.
+        done: whether there is nothing finer to paint.
     """
 
     look: Any
@@ -134,9 +134,9 @@ class Painter:
     belong to one thread; the others return at once and may be called from any.
 
     Args:
-        paint: makes a picture of a look, its longer side so many pixels, and tells the seconds that one takes. It calls
-            its third argument now and then, which raises :class:`Stopped` where nobody wants the picture any more.
-        show: gives a client a picture and the seconds.
+        paint: function of a look and a longer side in pixels that gives the picture and its seconds. It calls its
+            third argument now and then, which raises :class:`Stopped` when the picture is not wanted any more.
+        show: function that sends a client a picture and its seconds.
     """
 
     def __init__(
@@ -149,7 +149,7 @@ class Painter:
         self._speed, self._changed, self.closed = ASSUMED_SPEED, threading.Condition(), False
 
     def ask(self, client: int, look: Any, limit: Limit = Limit()) -> None:  # noqa: B008 (immutable)
-        """From now on a client looks at this. Nothing is painted anew for who looks at what it looked at before."""
+        """Set the look that a client wants painted; nothing is painted anew if it is the client's present look."""
         with self._changed:
             before = self._tasks.get(client)
             if before is not None and (before.look, before.limit) == (look, limit):
@@ -163,7 +163,7 @@ class Painter:
             self._changed.notify()
 
     def forget(self, client: int) -> None:
-        """A client has gone."""
+        """Drop the task of a client that has left."""
         with self._changed:
             self._tasks.pop(client, None)
 
@@ -174,12 +174,12 @@ class Painter:
             self._changed.notify()
 
     def repaint(self) -> None:
-        """Paint all again, as fine as it is: it looks different now."""
+        """Paint every client's picture again at its present size, as after a new checkpoint."""
         for task in self._tasks.copy().values():
             task.first = task.done = False
 
     def step(self, wait: float = 0.0) -> bool:
-        """Paint the next picture, and tell whether there was one within so many seconds."""
+        """Paint the next picture, and tell whether there was one within ``wait`` seconds."""
         with self._changed:
             self._changed.wait_for(lambda: self.closed or self._following() is not None, wait)
             following = self._following()
@@ -203,7 +203,7 @@ class Painter:
         return min(left, key=lambda each: each[1].size, default=None)
 
     def _finish(self, task: Task, seconds: float) -> None:
-        """Paint finer pictures after one, up to the limits."""
+        """After a painted picture, set the task's next, finer size, up to the client's limits."""
         with self._changed:
             self._speed = task.size**2 / max(seconds, 1e-6)  # pictures have other shapes, but the same before and after
             finest = task.limit.finest

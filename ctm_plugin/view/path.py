@@ -1,4 +1,4 @@
-"""A camera path through key frames: made, tried and saved."""
+"""Panel of the viewer to make, preview and save a camera path through key frames."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ PATH_STYLE = {"color": (80, 220, 120), "thickness": 2.0, "thickness_units": "scr
 
 
 def called(do: Callable[[], Awaitable[None] | None]) -> Callable[[object], Awaitable[None]]:
-    """``do`` as one of viser's callbacks, in the order of events: it runs those that are not coroutines in threads."""
+    """Wrap ``do`` as a coroutine for viser, which runs coroutines in the order of events, and others in threads."""
 
     async def callback(_: object) -> None:
         if (done := do()) is not None:
@@ -29,7 +29,7 @@ def called(do: Callable[[], Awaitable[None] | None]) -> Callable[[object], Await
 
 
 def camera_of(client: viser.ClientHandle) -> BrowserCamera | None:
-    """A client's camera, ``None`` while it has none."""
+    """The present camera of a browser client; ``None`` before the client has sent one."""
     at = client.camera
     camera = BrowserCamera(tuple(at.wxyz), tuple(at.position), at.fov, at.aspect)
     return camera if camera.usable() else None
@@ -39,10 +39,10 @@ class PathPanel:
     """Controls of the path that ``ctm render RUN path=FILE`` films.
 
     Args:
-        client: whose page.
-        name: of the scene, the saved file's.
-        size: of a drawn camera, in scene units.
-        aim: puts the client's camera somewhere.
+        client: viser's handle of the browser client.
+        name: name of the scene, used for the saved file.
+        size: size of a drawn camera in scene units.
+        aim: function that moves the client's camera.
         lit: controls of light in stops, contrast and saturation, which are saved with the path.
     """
 
@@ -68,13 +68,13 @@ class PathPanel:
         play.on_click(called(lambda: self._play(play.value == "play")))
 
     def key_frames(self) -> KeyFrames:
-        """What was made, at least one."""
+        """The path's key frames, at least one."""
         poses = np.stack([camera.c2w.double().numpy() for camera in self._keys])
         lit = tuple(float(control.value) for control in self._lit)
         return KeyFrames(poses, np.array([camera.fov for camera in self._keys]), bool(self._closed.value), lit)
 
     def set(self, keys: list[BrowserCamera]) -> None:
-        """Take and draw key frames."""
+        """Replace the path's key frames, and draw them."""
         self._keys, self._count.value, add = keys, str(len(keys)), self._client.scene
         for mark in self._marks:
             mark.remove()

@@ -1,4 +1,4 @@
-"""The server: the page of each client, and the painter behind all of them."""
+"""The viewer's web server: a page for each browser client, and one painter for all."""
 
 from __future__ import annotations
 
@@ -43,11 +43,11 @@ class Viewer:
     """A web server for one run, or several of the same scene.
 
     Args:
-        subjects: at least one.
+        subjects: the runs to serve, at least one.
         settings: where to listen, and in which light to begin.
 
     Attributes:
-        address: of the page, with its token where other machines reach it.
+        address: URL of the page, with a token where other machines can reach it.
 
     Raises:
         ConfigError: nothing can listen there.
@@ -136,7 +136,7 @@ def check_free(host: str, port: int) -> None:
     """Refuse an address that nothing can listen at; viser would wait for ever, or take another.
 
     Raises:
-        ConfigError: so it is.
+        ConfigError: the address is in use or cannot be used.
     """
     try:
         socket.create_server((host, port)).close()
@@ -146,7 +146,7 @@ def check_free(host: str, port: int) -> None:
 
 
 def page_address(host: str, port: int, token: str | None) -> str:
-    """Address of the page: this machine's name where the server listens at all of its addresses."""
+    """URL of the page, with this machine's name where the server listens at all addresses."""
     name = socket.gethostname() if host in ("0.0.0.0", "::") else f"[{host}]" if ":" in host else host
     return f"http://{name}:{port}/" + (f"?token={token}" if token else "")
 
@@ -154,7 +154,7 @@ def page_address(host: str, port: int, token: str | None) -> str:
 def admitted(path: str, headers: Mapping[str, str], token: str | None) -> bool:
     """Whether to answer a request: it comes from the server's own page or from none, and it has the token.
 
-    Without a token the server has this machine's own names only: another name may be another site's.
+    Without a token only this machine's names are accepted as host: another name may be another site's.
     """
     host, origin = headers.get("Host", ""), headers.get("Origin")
     if origin is not None and urlsplit(origin).netloc != host:
@@ -168,13 +168,13 @@ def admitted(path: str, headers: Mapping[str, str], token: str | None) -> bool:
 
 @contextmanager
 def guarded(token: str | None) -> Iterator[None]:
-    """A server that viser starts inside answers what is :func:`admitted`, and sends ``CONTENT_POLICY`` with its pages.
+    """Context in which a server of viser answers only :func:`admitted` requests, and sends ``CONTENT_POLICY``.
 
-    By itself it lets pages of other sites connect, also where the site's name was made to mean this machine (DNS
-    rebinding), asks nobody who comes from another machine, and its page loads a script for statistics from elsewhere.
+    By itself viser lets pages of other sites connect, also by DNS rebinding, and asks other machines for no token. Its
+    page loads a script for statistics from another host.
 
     Args:
-        token: what the page must be asked for with, as ``/?token=TOKEN``; the browser then keeps it as a cookie.
+        token: secret that the first request must have, as ``/?token=TOKEN``; the browser then keeps it as a cookie.
             ``None``: the server listens only to this machine.
     """
     serve = server.serve

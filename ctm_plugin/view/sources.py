@@ -33,14 +33,14 @@ photograph is shown."""
 
 
 class Subject:
-    """A run as its last checkpoint has it, also when that is replaced.
+    """A run to view, at its last checkpoint; it is read again when that is replaced.
 
     Args:
         folder: the run directory.
         root: the folder of its data, see :func:`ctm_plugin.runs.load.load_run`.
 
     Attributes:
-        trouble: why the checkpoint that is there now could not be used, else empty.
+        trouble: reason why the present checkpoint could not be used, else empty.
 
     Raises:
         CTMError: see :func:`ctm_plugin.runs.load.load_posed`.
@@ -56,9 +56,9 @@ class Subject:
         return self.run.module.scene
 
     def refresh(self) -> bool:
-        """Take another checkpoint than the one read last, and tell whether there is one.
+        """Load the run's checkpoint if it is newer than the loaded one, and tell whether it was.
 
-        One that cannot be used leaves all as it is and sets ``trouble``.
+        A checkpoint that cannot be used leaves the loaded one in place and sets ``trouble``.
         """
         stamp = self._stamp()
         if stamp in (None, self._read):
@@ -79,9 +79,9 @@ class Subject:
 
     @torch.no_grad()
     def render(self, shot: Viewpoint, height: int, width: int, check: Callable[[], None]) -> Rendered:
-        """Tensors that :meth:`ctm_plugin.runs.load.LoadedRun.picture` needs, on the CPU, ``[H, W, ...]``.
+        """Render the tensors ``[H, W, ...]`` that :meth:`ctm_plugin.runs.load.LoadedRun.picture` needs, on the CPU.
 
-        Of a crop box: rays begin where they enter it, and those that end behind it, by their expected depth, show the
+        With a crop box, rays begin where they enter it, and those that end behind it, by their expected depth, show the
         background; so do rays that miss it. In normalised device coordinates all rays begin at the near plane, and in
         whole pictures at the camera. ``check`` is called every ``RAY_CHUNK`` rays; whole pictures are too fast for it.
         """
@@ -119,12 +119,12 @@ class Subject:
 
 @dataclass(frozen=True, eq=False)
 class PhotographSource:
-    """One of a scene's views, turned as the camera is where it was taken; elsewhere it stays as taken.
+    """A photograph as a picture source: it turns with the browser's camera at its own place, and is fixed elsewhere.
 
     Attributes:
-        label: for people.
-        views, index: which one.
-        background: ``[1, 3]``, behind transparent pixels.
+        label: name shown in the page.
+        views, index: the photograph's view.
+        background: ``[1, 3]``, colour behind transparent pixels.
     """
 
     label: str
@@ -137,12 +137,12 @@ class PhotographSource:
         return view_camera(self.views, self.index)
 
     def seen_from(self, camera: BrowserCamera) -> bool:
-        """Whether a camera stands where it was taken."""
+        """Whether a camera stands at the place where the photograph was taken."""
         eye = np.array(self.camera.position)
         return bool(np.linalg.norm(eye - camera.position) <= PHOTOGRAPH_DISTANCE * max(1.0, float(np.linalg.norm(eye))))
 
     def render(self, shot: Viewpoint, height: int, width: int, check: Callable[[], None]) -> Rendered:
-        """Looked up where the camera's rays meet the photograph, through its lens; black outside it, ``[H, W, 3]``."""
+        """Look the photograph up along a camera's rays, through its lens, ``[H, W, 3]``; black outside it."""
         camera, views, index = shot.camera, self.views, self.index
         if not self.seen_from(camera):
             camera = replace(self.camera, fov=camera.fov, aspect=camera.aspect)
@@ -158,12 +158,12 @@ class PhotographSource:
         return {"rgb": sampled[0].permute(1, 2, 0) * inside}
 
     def picture(self, rendered: Rendered, kind: str, light: Light) -> Float[Tensor, "h w 3"]:
-        """Lit, unless the run's is as rendered: a photograph has no latent and no depth."""
+        """The photograph lit, or as taken for the kind ``rgb``: a photograph has no latent and no depth."""
         return rendered["rgb"] if kind == "rgb" else light.apply(rendered["rgb"])
 
 
 def photographs(scene: Scene, background: Float[Tensor, "1 3"]) -> list[PhotographSource]:
-    """The test views, then the training views, each by name."""
+    """Photograph sources of the test views, then of the training views, in order of their names."""
     return [
         PhotographSource(f"{label}{name}", views, index, background)
         for label, views in (("", scene.test), ("train: ", scene.train))

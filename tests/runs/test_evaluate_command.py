@@ -55,6 +55,7 @@ def test_the_same_numbers_and_pictures(compose, tmp_path, variant, capsys):
     assert where_again.endswith(f"written to {run / 'evaluation'}\nnext: ctm view {run}\n")
 
 
+@pytest.mark.slow
 def test_with_lpips(compose, ctm_data, tmp_path):
     weights = ctm_data / "lpips" / "alexnet_features.npz"
     scene = ("dataset=still_life", "dataset.downscale=4", "dataset.skip=50", f"metrics.lpips_weights={weights}")

@@ -29,6 +29,7 @@ STAGES = (
     "trainer.accumulate_grad_batches=2",
 )  # fmt: skip
 TWO = ("trainer.devices=2",)
+TORCHRUN = (sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc_per_node=2")
 OTHERS = {"PYTHONPATH": str(Path(distributed.__file__).parents[2])}
 """With which the other process, a fresh one, finds the package under test, installed or not."""
 
@@ -39,8 +40,7 @@ def test_two_processes_end_alike_and_step_as_one_does(arguments, compose, tmp_pa
     config = compose(*STAGES)
     train(config, tmp_path / "one")
     folder = f"hydra.run.dir={tmp_path / 'two'}"
-    torchrun = (sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc_per_node=2")
-    command = [*torchrun, ddp_rank.__file__, str(tmp_path), *arguments, *STAGES, *TWO, folder]
+    command = [*TORCHRUN, ddp_rank.__file__, str(tmp_path), *arguments, *STAGES, *TWO, folder]
     both = subprocess.run(command, env=os.environ | OTHERS, capture_output=True, text=True, timeout=120)
     assert both.returncode == 0, both.stderr
 
@@ -89,6 +89,23 @@ def test_a_sweep_of_two_processes_a_job(arguments, tmp_path):
         assert len(writers) == 2  # the curves, the scores
         assert len(set(writers)) == 1  # one process of two
         assert json.loads((run / METRICS).read_text())["steps"] == 2
+
+
+@pytest.mark.slow
+def test_two_processes_end_on_time_alike(arguments, tmp_path):
+    """The first one's clock cuts or stretches the schedule of both: to what 3 seconds allow, a quarter at least."""
+    splats = ("backbone=splat", "ctm=off", "trainer.image_every=null", "backbone.steps=100", "backbone.views=2")
+    splats += ("trainer.minutes=0.05",)
+    command = [*TORCHRUN, ddp_rank.__file__, str(tmp_path), *arguments, *splats, "trainer.accelerator=cpu", *TWO]
+    command += [f"hydra.run.dir={tmp_path / 'run'}"]
+    both = subprocess.run(command, env=os.environ | OTHERS, capture_output=True, text=True, timeout=120)
+    assert both.returncode == 0, both.stderr
+    first, second = (torch.load(tmp_path / f"rank{rank}.pt", weights_only=True) for rank in (0, 1))
+    saved = torch.load(tmp_path / "run" / LAST, weights_only=True)
+    assert len(saved["turns"]) > 1
+    assert saved["turns"][-1][2] == saved["global_step"]
+    assert first["batches"] == second["batches"] == saved["batches_seen"]
+    assert list(differing(first["weights"], second["weights"])) == []
 
 
 @pytest.mark.slow

@@ -160,6 +160,7 @@ def test_pictures_of_several_sizes_are_shown_without_what_fills_the_canvas(own, 
     assert [Image.open(own / f"again/photo/{name}.png").size for name in names] == [(40, 64), (64, 30)]
 
 
+@pytest.mark.slow
 def test_in_a_browser(own):
     """It opens as a file, asks nobody for anything, the line moves, and there is a scene to walk through."""
     posed = load_posed(own)

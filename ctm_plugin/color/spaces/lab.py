@@ -28,7 +28,7 @@ class Space(ColorTransform):
         )
 
     def decode(self, lab: Colors) -> Colors:
-        """Colours outside sRGB are clipped."""
+        """Invert :meth:`encode`; colours outside sRGB's gamut are clipped."""
         lightness, a, b = channels_of(lab)
         fy = (100.0 * lightness + 16.0) / 116.0
         fx = fy + (255.0 * a - 128.0) / 500.0

@@ -12,7 +12,7 @@ class Space(Bent):
 
     @staticmethod
     def curve(part: Values, a: Number) -> Values:
-        """``h(u) = log(1 + a u) / log(1 + a)``."""
+        """Evaluate the curve ``h(u) = log(1 + a u) / log(1 + a)``, u = ``part``."""
         return torch.log1p(a * part) / torch.log1p(a)
 
     @staticmethod

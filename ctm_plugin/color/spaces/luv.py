@@ -34,7 +34,7 @@ class Space(ColorTransform):
         return torch.stack([lightness / 100.0, (u + 134.0) / 354.0, (v + 140.0) / 262.0], dim=-1)
 
     def decode(self, luv: Colors) -> Colors:
-        """Chromaticities outside sRGB's are moved in, the rest is clipped."""
+        """Invert :meth:`encode`; chromaticities outside sRGB's ranges are moved in, other values clipped."""
         scaled, u, v = channels_of(luv)
         lightness = 100.0 * scaled
         chroma_scale = 13.0 * lightness.clamp(min=1e-4)

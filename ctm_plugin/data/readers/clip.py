@@ -33,7 +33,7 @@ HDR_CURVES = {"arib-std-b67": "HLG", "smpte2084": "PQ"}
 WIDE_PRIMARIES = ("bt2020", "smpte431", "smpte432")
 """ffmpeg's names of primaries that are neither sRGB's nor close to them."""
 MATRIX = re.compile("bt|smpte|fcc|gbr|ycgco|ictcp").match
-"""Matches ffmpeg's name of a YCbCr matrix."""
+"""Function that matches ffmpeg's name of a YCbCr matrix."""
 NO_MATCH = re.match("(x)?(x)?(x)?", "")
 """A match without groups, where ffmpeg names no duration or rate."""
 HD = 720
@@ -44,11 +44,11 @@ class ClipHeader(NamedTuple):
     """Metadata of a clip by ffmpeg.
 
     Attributes:
-        count: about how many frames it has; 0: it does not tell.
-        curve: ffmpeg's name of HLG or PQ; empty: none that is brighter than white.
-        primaries: ffmpeg's name of them; empty: sRGB's, or nearly.
+        count: approximate number of frames; 0: unknown.
+        curve: ffmpeg's name of the transfer function HLG or PQ; empty: the clip is not HDR.
+        primaries: ffmpeg's name of the colour primaries; empty: sRGB's, or nearly.
         deep: whether it has more than 8 bits.
-        matrix: the usual one where the clip names none; empty: it names one.
+        matrix: the YCbCr matrix to assume where the clip names none; empty: it names one.
     """
 
     count: int
@@ -59,10 +59,10 @@ class ClipHeader(NamedTuple):
 
 
 def read_clip(path: Path) -> ClipHeader:
-    """Read what a clip says of itself, without decoding it.
+    """Read a clip's metadata, without decoding it.
 
     Raises:
-        DataError: it is no clip, or a damaged one.
+        DataError: the file is no clip, or a damaged one.
     """
     require_file(path, CLIP_EXPECTED)
     output = subprocess.run(_ffmpeg(path), capture_output=True, text=True, errors="replace").stderr
@@ -73,7 +73,7 @@ def read_clip(path: Path) -> ClipHeader:
 
 
 def header_of(output: str) -> ClipHeader:
-    """A clip's header out of what ffmpeg prints of it.
+    """Parse a clip's header out of the text that ffmpeg prints.
 
     Example:
         >>> header_of("Video: hevc (Main 10), yuv420p10le(tv, bt2020nc/bt2020/arib-std-b67), 1920x1080, 30 fps")
@@ -99,7 +99,7 @@ def header_of(output: str) -> ClipHeader:
 
 
 def watched(path: Path) -> Iterator[Float32[np.ndarray, "h w"]]:
-    """A clip's frames one after the other, grey ``[H, W]`` of sRGB-like codes in [0, 1], at most ``WATCHED_SIDE`` long.
+    """Decode a clip's frames in turn, grey ``[H, W]`` of sRGB-like codes in [0, 1], at most ``WATCHED_SIDE`` long.
 
     A clip that ends too early gives what it has, with a warning.
 
@@ -123,7 +123,7 @@ def write_frames(path: Path, numbers: Sequence[int], folder: Path) -> ClipHeader
     HLG and PQ become sRGB with ``HDR_WHITE`` as 1; what is brighter is clipped, what is darker stays in proportion.
 
     Returns:
-        What the clip says of itself.
+        The clip's header.
     """
     header = read_clip(path)
     chosen = "+".join(f"eq(n,{number})" for number in numbers)
@@ -161,7 +161,7 @@ def _ffmpeg(path: Path) -> list[str]:
 
 @contextmanager
 def _running(path: Path, *arguments: str) -> Iterator[IO[bytes]]:
-    """ffmpeg on a clip's frames, as many as there are; its output, and a warning where it ends too early."""
+    """Context with the output of ffmpeg on a clip's frames; a warning where the clip ends too early."""
     program, *given = _ffmpeg(path)
     command = [program, "-v", "error", "-fflags", "+discardcorrupt", *given, "-an", "-sn", "-fps_mode", "passthrough"]
     with tempfile.TemporaryFile() as log:
@@ -182,6 +182,6 @@ def _running(path: Path, *arguments: str) -> Iterator[IO[bytes]]:
 
 
 def _first(complaints: str) -> str:
-    """ffmpeg's first complaint, the cause of others, without the part of it that complains."""
+    """ffmpeg's first error message, the cause of others, without the name of ffmpeg's component."""
     messages = re.findall(r"^\[[^\]]* @ [^\]]*\] (.+)$", complaints, re.M)
     return next((each for each in messages if "low score" not in each), " ".join(complaints.split()[-12:]))

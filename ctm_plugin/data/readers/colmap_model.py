@@ -39,7 +39,7 @@ UPRIGHT_NOTE = "as_shown.txt"
 """Name of the file that marks a model of upright pictures, as ``ctm cameras`` makes it; COLMAP's own is of stored
 pixels."""
 NOT_A_NUMBER = re.compile(r"[+-]?(nan|inf|1\.#)", re.IGNORECASE)
-"""How NaN and infinity are written, on Windows too: ``-nan(ind)``, ``1.#QNAN``."""
+"""Pattern of NaN and infinity in text, Windows' spellings included: ``-nan(ind)``, ``1.#QNAN``."""
 
 
 def model_file(folder: Path, name: str) -> Path:
@@ -49,18 +49,18 @@ def model_file(folder: Path, name: str) -> Path:
 
 
 def mark_as_shown(folder: Path, searched: Sequence[str]) -> None:
-    """Write down that a model is of pictures as EXIF's orientation turns them, and which were looked at for it."""
+    """Mark a model as made of pictures as EXIF's orientation turns them, with the names of the pictures searched."""
     note = f"Cameras of the pictures as EXIF's orientation turns them. images.bin: sha256 {_digest(folder)}"
     (folder / UPRIGHT_NOTE).write_text("\n".join([note, *searched, ""]), "utf-8")
 
 
 def searched_in(folder: Path) -> set[str]:
-    """The pictures that were looked at for the model that lies there now, by :func:`mark_as_shown`; none: it is not."""
+    """Names of the pictures that :func:`mark_as_shown` noted for the present model; empty if the model has no mark."""
     return {*(folder / UPRIGHT_NOTE).read_text("utf-8").split("\n")[1:-1]} if is_as_shown(folder) else set()
 
 
 def is_as_shown(folder: Path) -> bool:
-    """Tell whether :func:`mark_as_shown` marked the model that lies there now."""
+    """Tell whether :func:`mark_as_shown` marked the present model of a folder."""
     there = all((folder / name).is_file() for name in (UPRIGHT_NOTE, "images.bin"))
     return there and _digest(folder) in (folder / UPRIGHT_NOTE).read_text("utf-8", "replace")
 
@@ -70,13 +70,13 @@ def _digest(folder: Path) -> str:
 
 
 class Taken(NamedTuple):
-    """A registered picture.
+    """A picture that COLMAP registered.
 
     Attributes:
-        name: its path under ``images``.
+        name: the picture's path under ``images``.
         c2w: ``[3, 4]`` camera to world, OpenGL axes.
         camera: the camera's number.
-        points: numbers of the 3D points that it sees.
+        points: ids of the 3D points that the picture sees.
     """
 
     name: str
@@ -86,7 +86,7 @@ class Taken(NamedTuple):
 
 
 class Cursor:
-    """Reads a file from its start to its end; no length that it claims is believed before it is compared."""
+    """Reader of a binary file from start to end; lengths that the file claims are checked before use."""
 
     def __init__(self, path: Path):
         self.path, self.at = path, 0
@@ -107,20 +107,20 @@ class Cursor:
             raise self.fault(f"{count} {what}", f"what fits the {left} bytes that follow: the file is cut or damaged")
 
     def take(self, kinds: str, what: str) -> tuple:
-        """Numbers of these kinds, in :mod:`struct`'s letters, little-endian and packed."""
+        """Read numbers of these types, in :mod:`struct`'s letters, little-endian and packed."""
         form = struct.Struct(f"<{kinds}")
         self.need(1, form.size, what)
         self.at += form.size
         return form.unpack_from(self.data, self.at - form.size)
 
     def count(self, size: int, what: str) -> int:
-        """A number of things that follow, of at least ``size`` bytes each."""
+        """Read a count of items that follow, of at least ``size`` bytes each."""
         (count,) = self.take("Q", f"number of {what}")
         self.need(count, size, what)
         return count
 
     def text(self, what: str) -> str:
-        """A text that ends in a zero byte."""
+        """Read a text that ends in a zero byte."""
         end = self.data.find(b"\0", self.at)
         try:
             text = self.data[self.at : end].decode() if end >= 0 else ""
@@ -136,7 +136,7 @@ def as_binary(path: Path) -> tuple[bytes, list[tuple[int, int]]]:
     """Pack ``cameras.txt``, ``images.txt`` or ``points3D.txt`` into what COLMAP's binary file would hold.
 
     Returns:
-        That, and for each record where it begins there and on which line of the text it stands.
+        The bytes, and for each record its offset in them and its line in the text.
     """
     pack, expected = TEXT_LAYOUTS[path.stem]
     content = read_bytes(path, "a file of COLMAP's text model")
@@ -194,7 +194,7 @@ TEXT_LAYOUTS: dict[str, tuple[Callable[[str, str], bytes], str]] = {
 
 
 def read_cameras(path: Path) -> dict[int, Intrinsics | DataError]:
-    """Cameras by their numbers; in place of one with impossible numbers its fault."""
+    """Read cameras by their ids; a camera with impossible values is replaced by the error that describes it."""
     cursor = Cursor(path)
     cameras = {}
     for _ in range(cursor.count(24, "cameras")):
@@ -215,7 +215,7 @@ def read_cameras(path: Path) -> dict[int, Intrinsics | DataError]:
 
 
 def parameters(cursor: Cursor, name: str, values: tuple[float, ...]) -> tuple:
-    """fx, fy, cx, cy and the distortion (k1, k2, p1, p2, k3) out of a model's own order."""
+    """Turn a camera model's parameters into fx, fy, cx, cy and the distortion (k1, k2, p1, p2, k3)."""
     if not all(-1e9 < value < 1e9 for value in values):
         raise cursor.fault(f"camera parameters {values}", "finite numbers")
     single = name.startswith("SIMPLE") or name == "RADIAL"
@@ -229,7 +229,7 @@ def parameters(cursor: Cursor, name: str, values: tuple[float, ...]) -> tuple:
 
 
 def read_images(path: Path, cameras: dict[int, Intrinsics | DataError]) -> list[Taken | DataError]:
-    """The registered pictures; in place of one with an impossible pose or camera its fault."""
+    """Read the registered pictures; one with an impossible pose or camera is replaced by the error that says so."""
     cursor = Cursor(path)
     taken = []
     for _ in range(cursor.count(73, "pictures")):
@@ -252,7 +252,7 @@ def read_images(path: Path, cameras: dict[int, Intrinsics | DataError]) -> list[
 
 
 def usable(pictures: Sequence[Taken | DataError]) -> list[Taken]:
-    """Leave out those with a fault, with one warning; that of the first is raised where all have one."""
+    """Leave out pictures that are errors, with one warning; the first error is raised where all are errors."""
     faults = [each for each in pictures if isinstance(each, DataError)]
     if faults and len(faults) == len(pictures):
         raise faults[0]
@@ -273,7 +273,7 @@ def camera_to_world(cursor: Cursor, number: int, pose: Float64[np.ndarray, " 7"]
 
 
 def read_points(path: Path) -> tuple[Int64[np.ndarray, " p"], Float64[np.ndarray, "p 3"]]:
-    """Numbers, in order, and positions ``[P, 3]`` of the points; none that are absurdly far away."""
+    """Read the points' ids, in order, and positions ``[P, 3]``, without those that are absurdly far away."""
     cursor = Cursor(path)
     numbers, positions = [], []
     for _ in range(cursor.count(51, "points")):

@@ -33,12 +33,12 @@ GREY, COLOUR = (("Y",), ("Y", "A")), (("R", "G", "B"), ("R", "G", "B", "A"))
 LENS_NAMES = ("Make", "Model", "Exif:FocalLength", "Exif:FocalLengthIn35mmFilm", "Exif:DigitalZoomRatio")
 """OpenImageIO's names of what :class:`Lens` has."""
 WHOLE, LIGHT = ("uint8", "uint16"), ("half", "float", "double")
-"""Types of numbers, as OpenImageIO calls them."""
+"""OpenImageIO's names of the number types of stored levels, and of those of linear light."""
 
 
 @contextmanager
 def opened_file(path: Path) -> Iterator[Any]:
-    """OpenImageIO's own of a file, whose alpha stays as it is stored; what it cannot read is an OSError."""
+    """Context with OpenImageIO's reader of a file, alpha as stored; unreadable files raise OSError."""
     import OpenImageIO as oiio  # a fifth of a second, of which few data sets have a use
 
     asked = oiio.ImageSpec()
@@ -53,7 +53,7 @@ def opened_file(path: Path) -> Iterator[Any]:
 
 
 def numbers(file: Any) -> np.ndarray:
-    """A file's first picture ``[H, W, C]``, in the type that it is stored in."""
+    """Read a file's first picture ``[H, W, C]``, in its stored number type."""
     spec = file.spec()
     found = file.read_image(0, 0, 0, spec.nchannels, spec.format)
     if found is None:
@@ -62,7 +62,7 @@ def numbers(file: Any) -> np.ndarray:
 
 
 def colored(pixels: np.ndarray) -> np.ndarray:
-    """Colour ``[H, W, C]``, C = 3 or 4, out of grey, without alpha or with it; colour as it is."""
+    """Turn grey, with or without alpha, into colour ``[H, W, C]``, C = 3 or 4; colour stays as it is."""
     return pixels if pixels.shape[-1] > 2 else pixels[..., [0, 0, 0, *range(1, pixels.shape[-1])]]
 
 
@@ -81,7 +81,7 @@ def write_light(path: Path, light: Float32[np.ndarray, "h w 3"], orientation: in
 
 @contextmanager
 def open_deep(path: Path) -> Iterator[Opened]:
-    """A TIFF or an EXR. 16 bits, and 8 without an ICC profile, are taken for sRGB, floats for linear light."""
+    """Open a TIFF or an EXR. 16 bits, and 8 without an ICC profile, are taken for sRGB, floats for linear light."""
     require_file(path, EXPECTED)
     with told(path, "a picture that cannot be read", EXPECTED), opened_file(path) as file:
         spec = file.spec()

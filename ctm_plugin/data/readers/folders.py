@@ -1,4 +1,4 @@
-"""Files of a data set: named inside its folder only, every fault a :class:`DataError`."""
+"""Access to a data set's files: only inside its folder, every fault a :class:`DataError`."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ RAW_HINT = (
 
 
 def others_hint(paths: Iterable[Path]) -> str:
-    """Say how to turn the first of these that is a picture of another kind into one that is read."""
+    """Word the hint how to convert the first of these files that is a picture in an unsupported format."""
     known = (*UNREAD_SUFFIXES, *IMAGE_SUFFIXES)
     path = next((path for path in paths if path.suffix.lower() in known), Path("images", "1.BMP"))
     into = "png" if path.suffix.lower() in UNREAD_SUFFIXES else path.suffix[1:]
@@ -38,7 +38,7 @@ def others_hint(paths: Iterable[Path]) -> str:
 
 
 def reason(error: BaseException) -> str:
-    """One line that says what an exception says, without paths."""
+    """An exception's message in one line, without paths."""
     text = getattr(error, "strerror", None) or str(error) or type(error).__name__
     if type(error).__name__.startswith("LibRaw"):  # bytes, as Python shows them
         text = text.removeprefix("b'").removesuffix("'")
@@ -47,7 +47,7 @@ def reason(error: BaseException) -> str:
 
 @contextmanager
 def told(path: Path, found: str, expected: str) -> Iterator[None]:
-    """Tell of whatever goes wrong inside by file, what was ``found`` and what was ``expected``.
+    """Context that turns any error into a :class:`DataError` with the file, what was ``found`` and ``expected``.
 
     Systems and decoders raise all that their parsers do on damaged files: OSError, SyntaxError, struct.error, ...
     """
@@ -60,7 +60,7 @@ def told(path: Path, found: str, expected: str) -> Iterator[None]:
 
 
 def require_folder(root: str | Path, expected: str) -> Path:
-    """The folder of a data set, which should hold what is ``expected``."""
+    """Find a data set's folder, or refuse it if missing; ``expected`` says in the error what it should hold."""
     with told(Path(root), "a folder that cannot be read", expected):
         root = Path(root).expanduser()
         if not root.exists():
@@ -73,7 +73,7 @@ def require_folder(root: str | Path, expected: str) -> Path:
 
 
 def require_file(path: Path, expected: str) -> None:
-    """Refuse what is no regular file: a pipe would block, a device never end; and files that were not fetched."""
+    """Refuse a path that is no regular file (a pipe would block, a device never end), or not fetched by Git LFS."""
     with told(path, "a file that cannot be read", expected):
         if not path.exists():
             raise DataError(path, "no such file", expected)
@@ -95,12 +95,12 @@ def read_bytes(path: Path, expected: str) -> bytes:
 
 
 def is_picture(path: Path) -> bool:
-    """Tell whether a file is a picture by its name; hidden ones, such as macOS's ``._IMG_1.jpg``, are none."""
+    """Tell whether a file is a picture by its suffix; hidden files, such as macOS's ``._IMG_1.jpg``, are not."""
     return path.suffix.lower() in IMAGE_SUFFIXES and not path.name.startswith(".")
 
 
 def plain_name(name: str, root: Path | None = None) -> str:
-    """Write a path as a file gives it: no ``./``, Windows' separators as ``/``, relative where it lies in ``root``."""
+    """Normalise a path in a file: no ``./``, Windows' separators as ``/``, relative where it lies in ``root``."""
     plain = str(PurePosixPath(name.replace("\\", "/")))
     return plain if root is None else plain.removeprefix(f"{os.path.abspath(root)}/")
 
@@ -108,7 +108,7 @@ def plain_name(name: str, root: Path | None = None) -> str:
 def inside(root: Path, name: str, source: Path | None = None) -> Path:
     """Find ``root / name``, which stays inside ``root``: ``..`` is resolved in the name itself, links are followed.
 
-    What the folder's owner linked into it is his; what somebody wrote into a file, ``source``, may not lead out of it.
+    Links that the folder's owner made may lead out of it; names written in a file, ``source``, may not.
     """
     source = source or root / name
     expected = "a path inside the data set's folder, relative to it"
@@ -129,7 +129,7 @@ def inside(root: Path, name: str, source: Path | None = None) -> Path:
 def look_for(root: Path, name: str, source: Path) -> Path | None:
     """The image that ``source`` calls ``name``, written with or without its suffix; ``None`` where there is none.
 
-    Where there is none of just that name, one that other systems take for the same will do: ``a.JPG`` for ``a.jpg``, or
+    Without an exact match, a name that other systems take for the same is accepted: ``a.JPG`` for ``a.jpg``, or
     an umlaut that is composed in another way.
     """
     for suffix in ("", *IMAGE_SUFFIXES):
@@ -147,12 +147,12 @@ def look_for(root: Path, name: str, source: Path) -> Path | None:
 
 
 def fold(name: str) -> str:
-    """Write a name so that those which macOS or Windows take for the same are alike."""
+    """Normalise a file name so that names that macOS or Windows take for the same become equal."""
     return unicodedata.normalize("NFC", name).casefold()
 
 
 def folded(folder: Path) -> dict[str, Path]:
-    """List a folder by :func:`fold`; empty where there is none."""
+    """Map each :func:`fold`-ed name in a folder to its path; empty if the folder does not exist."""
     return _listed(folder, folder.stat().st_mtime_ns) if folder.is_dir() else {}
 
 

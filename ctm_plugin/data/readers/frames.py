@@ -62,13 +62,13 @@ IGNORED_KEYS = (
 
 
 def says(owner: Record, key: str) -> bool:
-    """Tell whether something stands there; 0, false, null, nothing and lists of these say nothing."""
+    """Tell whether a key has a value that matters: not missing, 0, false, null, or a list of these."""
     value = owner.values.get(key)
     return any(value) if isinstance(value, list) else bool(value)
 
 
 def angle_alone(path: Path) -> bool:
-    """Tell whether a file gives its cameras only by ``camera_angle_x``, as Synthetic-NeRF's; or it is broken."""
+    """Tell whether a file gives its cameras only by ``camera_angle_x``, as Synthetic-NeRF's do, or is broken."""
     with suppress(DataError):
         return _angle_alone(read_record(path))
     return True
@@ -81,7 +81,7 @@ def _angle_alone(record: Record) -> bool:
 
 
 def check_keys(owners: Iterable[Record]) -> None:
-    """Refuse what cannot be done, and say in one warning what is not known, of files, each followed by its frames."""
+    """Refuse unsupported keys, and warn once of unknown ones, in files, each followed by its frames."""
     owners = list(owners)
     masked = any(says(owner, MASK_KEY) for owner in owners)
     known = {*SIZE_KEYS, *LENS_KEYS, *REFUSED_KEYS, *FRAME_KEYS, *FILE_KEYS, *IGNORED_KEYS, "camera_angle_x"}
@@ -106,7 +106,7 @@ def frames_of(record: Record) -> list[Record]:
 
 
 def read_pose(frame: Record) -> np.ndarray:
-    """``[3, 4]`` camera to world, whose last row ``0 0 0 1`` may be left out."""
+    """Read a frame's camera to world, ``[3, 4]``; in the file its last row ``0 0 0 1`` may be left out."""
     given = frame.values.get("transform_matrix")
     whole = not (isinstance(given, list) and len(given) == 3)
     pose = frame.matrix("transform_matrix", 3 + whole, 4, MAX_COORDINATE)
@@ -116,9 +116,9 @@ def read_pose(frame: Record) -> np.ndarray:
 
 
 def read_camera(record: Record, frame: Record, width: int, height: int, remarks: dict[str, str]) -> Intrinsics:
-    """The camera of one frame: each of its numbers the frame's own, else the file's, else the picture's.
+    """Read a frame's intrinsics: each number from the frame, else from the file, else from the picture.
 
-    ``remarks`` gets the remarks on the cameras, once for each key.
+    ``remarks`` collects warnings about the cameras, one for each key.
     """
 
     def given(key: str) -> Record | None:
@@ -135,7 +135,7 @@ def read_camera(record: Record, frame: Record, width: int, height: int, remarks:
     height = number("h", float(height), is_length, pixels)
 
     def focal(axis: str, side: float) -> tuple[float | None, float | None]:
-        """In pixels, as ``fl_<axis>`` and as the angle give it; a frame's own number goes before the file's."""
+        """Focal lengths in pixels by ``fl_<axis>`` and by the field of view; a frame's value goes before the file's."""
         owner, other = given(f"fl_{axis}"), given(f"camera_angle_{axis}")
         if owner and other and owner is not other:
             owner, other = (owner, None) if owner is frame else (None, other)
@@ -170,14 +170,14 @@ def read_camera(record: Record, frame: Record, width: int, height: int, remarks:
 
 
 def differ(length: float | None, other: float | None) -> bool:
-    """Tell whether two focal lengths are there and further apart than ``FOCAL_TOLERANCE``."""
+    """Tell whether two focal lengths are both given and differ by more than ``FOCAL_TOLERANCE``."""
     return length is not None and other is not None and abs(other / length - 1) > FOCAL_TOLERANCE
 
 
 def check_view(camera: Intrinsics, source: Path, sized: bool, remarks: dict[str, str]) -> None:
-    """Refuse intrinsics that are not of a picture of the camera's size, and remark on those that few lenses have.
+    """Refuse intrinsics that do not fit a picture of the camera's size, and remark on unusual ones.
 
-    ``sized`` is whether the file tells the camera's size; else it is the picture's.
+    ``sized`` is whether the file gives the camera's size; else the picture's size is taken.
     """
     width, height, cx, cy = camera.width, camera.height, camera.cx, camera.cy
     found = f"{camera.where} with fl_x {camera.fx:g}, fl_y {camera.fy:g}, cx {cx:g}, cy {cy:g} for {width:g}x{height:g}"

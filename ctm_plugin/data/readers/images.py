@@ -1,4 +1,4 @@
-"""Reading pictures, all checks included."""
+"""Picture files by suffix: format and size checks, headers, and pixels decoded on demand."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ warnings.filterwarnings("ignore", category=Image.DecompressionBombWarning)  # th
 
 @contextmanager
 def opened(path: Path) -> Iterator[Image.Image]:
-    """The picture, not yet decoded."""
+    """Context with Pillow's picture of a file, not yet decoded."""
     expected = f"a whole image ({', '.join(PILLOW_FORMATS)}, HEIC) of at most {MAX_PIXELS} pixels"
     require_file(path, expected)
     with told(path, "an image that cannot be read", f"{expected}: copy it here again, or leave it out"):
@@ -70,7 +70,7 @@ def opened(path: Path) -> Iterator[Image.Image]:
 
 
 def heif_formats() -> tuple[str, ...]:
-    """Pillow's names of the formats that pillow-heif opens for it: HEIC and others, upright."""
+    """Register pillow-heif with Pillow, and name the formats that it opens: HEIC and others, upright."""
     try:
         from pillow_heif import register_heif_opener
     except ImportError as error:
@@ -88,7 +88,7 @@ def deep_heic(path: Path) -> UInt16[np.ndarray, "h w c"]:
 
 
 def is_adobe_rgb(exif: Image.Exif) -> bool:
-    """Whether EXIF says so."""
+    """Whether EXIF says that a picture's colours are Adobe RGB."""
     with suppress(KeyError):  # Pillow before 13, where there is no such part
         return exif.get_ifd(ExifTags.IFD.Interop).get(ExifTags.Interop.InteropIndex) == "R03"
     return False
@@ -96,9 +96,9 @@ def is_adobe_rgb(exif: Image.Exif) -> bool:
 
 @contextmanager
 def open_usual(path: Path) -> Iterator[Opened]:
-    """PNG, JPEG, WebP, AVIF and HEIC. Grey becomes colour, palettes are looked up, 10 to 16 bits are kept.
+    """Open a PNG, JPEG, WebP, AVIF or HEIC. Grey becomes colour, palettes are looked up, 10 to 16 bits are kept.
 
-    ICC profiles (of 8 bits) and PNG's gAMA become sRGB; of others the header tells.
+    ICC profiles (of 8 bits) and PNG's gAMA are converted to sRGB; the header names other colours.
     """
     with opened(path) as image:
         # A PNG's own getexif would decode the whole picture.
@@ -137,11 +137,11 @@ DECODERS: dict[str, Decoder] = {
     **dict.fromkeys((".png", ".jpg", ".jpeg", ".webp", *PHONE_SUFFIXES), open_usual),
     **dict.fromkeys((".tif", ".tiff", ".exr"), open_deep),
 }
-"""Decoder of a picture by its suffix; other suffixes are tried as the first."""
+"""Decoder of a picture by its file's suffix; other suffixes get PNG's decoder."""
 
 
 def open_picture(path: Path) -> AbstractContextManager[Opened]:
-    """A picture of any of the ``DECODERS``."""
+    """Open a picture by the one of :data:`DECODERS` for its suffix."""
     return DECODERS.get(path.suffix.lower(), open_usual)(path)
 
 
@@ -151,8 +151,8 @@ class PictureFile:
 
     Attributes:
         path: the file.
-        header: what it says of itself.
-        decode: what opens it.
+        header: its size, depth, orientation and other metadata.
+        decode: the decoder that opens it.
     """
 
     path: Path
@@ -160,11 +160,11 @@ class PictureFile:
     decode: Decoder = open_picture
 
     def as_stored(self) -> PictureFile:
-        """The same file, read without EXIF's rotation."""
+        """The same picture file, read without EXIF's rotation."""
         return replace(self, header=self.header.as_stored())
 
     def image(self) -> Float32[Tensor, "h w c"]:
-        """Its pixels, ``[H, W, C]`` as it is to be shown, C = 4 with straight alpha where the file has it, else 3.
+        """Decode the pixels ``[H, W, C]``, upright by EXIF; C = 4 with straight alpha where the file has it, else 3.
 
         In [0, 1], but for float TIFF and EXR, whose linear light may be more.
         """
@@ -180,12 +180,12 @@ def read_picture(path: Path, decode: Decoder = open_picture) -> PictureFile:
 
 
 def read_image(path: Path) -> Float32[Tensor, "h w c"]:
-    """A picture's pixels, see :meth:`Picture.image`."""
+    """Read a picture's pixels, see :meth:`PictureFile.image`."""
     return read_picture(path).image()
 
 
 def read_depth(path: Path, scale: float) -> Float32[Tensor, "h w"]:
-    """Depth ``[H, W]`` times ``scale``, NaN where nothing was hit: 16-bit grey, 0 for nothing, or a ``.npy``."""
+    """Read depth ``[H, W]``, times ``scale``, NaN where nothing was hit: 16-bit grey, 0 for nothing, or a ``.npy``."""
     if path.suffix != ".npy":
         with opened(path) as image:
             if not image.mode.startswith("I"):
@@ -203,7 +203,7 @@ def read_depth(path: Path, scale: float) -> Float32[Tensor, "h w"]:
 
 
 def map_numbers(path: Path, expected: str) -> np.ndarray:
-    """An array ``[...]`` of floats out of a ``.npy``, mapped: its length bounds what its header may claim."""
+    """Memory-map an array ``[...]`` of floats in a ``.npy``: the file's length bounds what its header may claim."""
     require_file(path, expected)
     with told(path, "no array that can be read", expected):
         array = np.lib.format.open_memmap(path, mode="r")
@@ -213,7 +213,7 @@ def map_numbers(path: Path, expected: str) -> np.ndarray:
 
 
 def to_8_bits(image: Float32[Tensor, "*shape c"]) -> UInt8[Tensor, "*shape c"]:
-    """``round(255 c)``; colour is 0 where the rounded alpha is 0."""
+    """Round a picture to 8 bits, ``round(255 c)``; colour is 0 where the rounded alpha is 0."""
     levels = (image * 255.0).round().clamp(0, 255).to(torch.uint8)
     if levels.shape[-1] == 4:
         levels[levels[..., 3] == 0] = 0

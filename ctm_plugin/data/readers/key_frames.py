@@ -25,8 +25,8 @@ LIGHT_RANGES = dict(zip(LIGHT_KEYS, ((-MAX_STOPS, MAX_STOPS), CONTRASTS, SATURAT
 def read_key_frames(path: Path) -> KeyFrames:
     """Read ``{"closed": false, "keys": [{"camera_to_world": 3x4, "fov": degrees}, ...]}``.
 
-    ``camera_to_world`` has OpenGL axes, ``fov`` is vertical; ``closed`` may be left out. So may the light that the path
-    was seen in: ``light`` in stops, ``contrast`` and ``saturation``, all three of them or none.
+    ``camera_to_world`` has OpenGL axes, ``fov`` is vertical; ``closed`` may be left out. So may the light in which the
+    path was made: ``light`` in stops, ``contrast`` and ``saturation``, all three of them or none.
     """
     whole = parse_record(read_bytes(path, "a file of key frames"), path)
     closed = "closed" in whole and whole.checked("closed", lambda value: isinstance(value, bool), PATH_EXPECTED)

@@ -1,4 +1,4 @@
-"""Layouts of a folder's files: each loader opens its folder here. An error names the one that fits."""
+"""Layouts of a data set's folder, recognised by its files. Errors name the layout that fits."""
 
 from __future__ import annotations
 
@@ -35,12 +35,12 @@ FOREIGN_CAPTURES = (
     ("opensfm/reconstruction.json", b"", "OpenDroneMap's cameras", "odm --data {root}"),
     ("odm_report/shots.geojson", b"", "OpenDroneMap's cameras", "odm --data {root}"),
 )
-"""Captures of other programs: a file's name, its first bytes, whose it is, and the arguments with which ns-process-data
-turns it into a transforms.json."""
+"""Captures of other programs: a file's name, its first bytes, the program's name, and the arguments with which
+ns-process-data turns it into a transforms.json."""
 
 
 def open_layout(root: str | Path, layout: str) -> Path:
-    """Open the folder of a data set of this layout."""
+    """Find the folder of a data set, or refuse one without files of ``layout``."""
     with suppress(OSError, ValueError, RuntimeError):  # what cannot be a path is refused below
         path = Path(root).expanduser()
         if path.is_file() and layouts(path.parent):
@@ -56,7 +56,7 @@ def open_layout(root: str | Path, layout: str) -> Path:
 
 
 def way_out(root: Path) -> str:
-    """Say what to do with a folder without files of any layout: which folder near it has some, or where to get them."""
+    """Word the hint for a folder without files of any layout: a folder near it that has some, or how to make them."""
     quoted = shlex.quote(str(root))
     with told(root, "a folder that cannot be read", "the folder of a data set"):
         for path in sorted(root.glob("*.[jJ][sS][oO][nN]")):
@@ -79,7 +79,7 @@ def way_out(root: Path) -> str:
 
 
 def foreign(root: Path) -> str:
-    """Say whose cameras lie in a folder, and what turns them into a ``transforms.json``, see ``FOREIGN_CAPTURES``."""
+    """Name the program whose cameras lie in a folder, and what makes a ``transforms.json`` (``FOREIGN_CAPTURES``)."""
     for pattern, start, whose, converter in FOREIGN_CAPTURES:
         for path in sorted(root.glob(pattern)):
             if not start or (path.is_file() and start in path.read_bytes()[:1000]):
@@ -91,7 +91,7 @@ def foreign(root: Path) -> str:
 
 
 def of_photographs(root: Path) -> str:
-    """Say how to find the cameras of the photographs in a folder; empty where there are none."""
+    """Word the hint how to find the cameras of a folder's photographs; empty where there are no photographs."""
     quoted = shlex.quote(str(root))
     if any(map(is_picture, root.iterdir())):
         return f"ctm cameras {quoted} finds those of the photographs, for dataset=colmap"
@@ -125,11 +125,11 @@ def layouts(root: Path) -> list[str]:
 
 
 def model_folder(root: Path) -> Path | None:
-    """Find where COLMAP's model lies, binary or text; ``None``: nowhere."""
+    """Find the folder of COLMAP's model, binary or text; ``None``: there is none."""
     return next(iter(model_folders(root)), None)
 
 
 def model_folders(root: Path) -> list[Path]:
-    """List where COLMAP's models lie, the one that is taken first."""
+    """List the folders of COLMAP's models, first the one that is read."""
     folders = dict.fromkeys([*(root / name for name in MODEL_FOLDERS), *sorted(root.glob("*sparse/[0-9]*"))])
     return [each for each in folders if any((each / f"cameras.{kind}").exists() for kind in ("bin", "txt"))]

@@ -49,10 +49,10 @@ class Intrinsics(NamedTuple):
     """Intrinsics and distortion of a photograph's camera, in pixels of the picture as it was taken.
 
     Attributes:
-        width, height: of the picture.
+        width, height: size of the picture.
         fx, fy, cx, cy: focal lengths and principal point, the first pixel's centre at 0.5.
         distortion: (k1, k2, p1, p2, k3), see :func:`ctm_plugin.rays.cameras.distort`.
-        where: its place in the file that says so, for messages.
+        where: the intrinsics' place in their file, for messages.
     """
 
     width: float
@@ -66,11 +66,11 @@ class Intrinsics(NamedTuple):
 
     @property
     def pinhole(self) -> tuple[float, float, float, float]:
-        """(fx, fy, cx, cy)."""
+        """Focal lengths and principal point (fx, fy, cx, cy) in pixels."""
         return self.fx, self.fy, self.cx, self.cy
 
     def scaled(self, width: int, height: int) -> Intrinsics:
-        """The camera of the same picture in another size, exactly: x and y apart."""
+        """Intrinsics of the same picture in another size; x and y are scaled separately."""
         across, down = width / self.width, height / self.height
         return self._replace(
             width=width, height=height, fx=self.fx * across, fy=self.fy * down, cx=self.cx * across, cy=self.cy * down
@@ -79,10 +79,10 @@ class Intrinsics(NamedTuple):
     def of_picture(
         self, width: int, height: int, path: Path, source: Path, crop: tuple[int, ...] | None = None
     ) -> Intrinsics:
-        """The camera of a picture that may be of another size than ``source`` says.
+        """Intrinsics of a picture that may have another size than ``source`` says.
 
         The same picture at another scale is recognised by its ratio; at nearly the same scale it may be cut
-        instead, of which ``crop`` tells: (left, top) pixels cut off; empty: none were; ``None``: nobody says.
+        instead, as ``crop`` says: (left, top) pixels cut off; empty: none were; ``None``: unknown.
         """
         found = f"a picture of {width}x{height}"
         frame = f"{self.width:g}x{self.height:g} as {self.where} of {source.name}"

@@ -1,4 +1,4 @@
-"""Parts that all decoders of pictures share: the header, the largest size, the orientation."""
+"""Parts that all decoders of pictures share: header, size limit, EXIF's orientation and exposure."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ from ctm_plugin.color.srgb import linear_to_srgb
 from ctm_plugin.errors import DataError
 
 MAX_PIXELS = 64_000_000
-"""Most pixels of a picture that is decoded, at 15 bytes each: a small file can claim more than memory holds."""
+"""Largest number of pixels of a picture to decode, at 15 bytes each: a small file can claim more than memory holds."""
 UPRIGHT_ORIENTATION = 1
 """EXIF's orientation of a picture that is stored upright."""
 
 
 class Lens(NamedTuple):
-    """Camera, lens and focal length by EXIF; ``None`` where it has none.
+    """Camera, lens and focal length by EXIF; ``None`` where EXIF does not give one.
 
     Attributes:
-        maker, model: of the camera.
+        maker, model: the camera's maker and model.
         focal: the lens's focal length in millimetres.
-        film: that of a lens that shows as much on 35 mm film, in millimetres.
-        zoom: how often the picture was enlarged.
+        film: focal length of the same field of view on 35 mm film, in millimetres.
+        zoom: factor of digital zoom.
     """
 
     maker: str | None = None
@@ -44,13 +44,13 @@ class Header(NamedTuple):
     """Metadata of a picture before it is decoded.
 
     Attributes:
-        height, width: in pixels, of the picture as it is shown.
+        height, width: in pixels, of the picture turned upright.
         alpha: whether it has transparency.
         deep: whether it holds more than 8 bits a channel.
-        orientation: how it was turned to be shown, in EXIF's numbers, 1 to 8; 1: not at all.
-        exposure: the light that it took by its EXIF, see :func:`exposure_of`; ``None``: it does not tell.
-        colours: what it says of its colours where they are not sRGB's and are not converted.
-        lens: what took it by its EXIF, see :class:`Lens`.
+        orientation: the turn that makes it upright, in EXIF's numbers, 1 to 8; 1: none.
+        exposure: exposure by EXIF, see :func:`exposure_of`; ``None``: EXIF does not give it.
+        colours: name of its colours where they are not sRGB's and are not converted.
+        lens: camera and lens by EXIF, see :class:`Lens`.
     """
 
     height: int
@@ -69,12 +69,12 @@ class Header(NamedTuple):
 
 
 class Opened(NamedTuple):
-    """A picture that is open: what it says of itself, and its pixels, decoded when asked for.
+    """An open picture file: its header, and its pixels, decoded on demand.
 
     Attributes:
         header: see :class:`Header`.
         pixels: ``[H, W, 3]``, or ``[H, W, 4]`` with straight alpha, float32 sRGB as the file stores them, not turned;
-            in [0, 1] unless it holds light.
+            in [0, 1] unless it holds linear light.
     """
 
     header: Header
@@ -92,16 +92,16 @@ def check_size(path: Path, width: int, height: int, expected: str) -> None:
 
 
 def upright_header(height: int, width: int, alpha: bool, deep: bool, orientation: int) -> Header:
-    """The header of a picture that is stored in this size; orientations that EXIF does not know count as none."""
+    """Make the header of a picture stored in this size; orientations that EXIF does not define count as none."""
     orientation = orientation if 1 <= orientation <= 8 else UPRIGHT_ORIENTATION
     return Header(*((width, height) if orientation > 4 else (height, width)), alpha, deep, orientation)
 
 
 def exposure_of(exif: Mapping[int, Any]) -> float | None:
-    """The light that a picture took, up to its camera's own factor: seconds x ISO / 100 / f-number².
+    """Exposure of a picture, up to a factor of its camera: seconds x ISO / 100 / f-number².
 
-    By EXIF's own tags, of which ISO and f-number count as 100 and 1 where they are missing or no numbers > 0; ``None``
-    without an exposure time > 0.
+    By EXIF's tags; ISO and f-number count as 100 and 1 where they are missing or no numbers > 0. ``None`` without an
+    exposure time > 0.
     """
     tags = ExifTags.Base
     seconds, iso, f_number = (positive(exif, tag) for tag in (tags.ExposureTime, tags.ISOSpeedRatings, tags.FNumber))
@@ -109,7 +109,7 @@ def exposure_of(exif: Mapping[int, Any]) -> float | None:
 
 
 def lens_of(image: Mapping[int, Any], exif: Mapping[int, Any]) -> Lens:
-    """The lens by EXIF's own tags: of the picture's directory, and of its part ``exif``."""
+    """Read the lens by EXIF's tags: of the picture's directory, ``image``, and of the EXIF directory, ``exif``."""
     tags = ExifTags.Base
     names = [str(image[tag]) if tag in image else None for tag in (tags.Make, tags.Model)]
     lengths = (tags.FocalLength, tags.FocalLengthIn35mmFilm, tags.DigitalZoomRatio)
@@ -117,7 +117,7 @@ def lens_of(image: Mapping[int, Any], exif: Mapping[int, Any]) -> Lens:
 
 
 def positive(exif: Mapping[int, Any], tag: int) -> float | None:
-    """A tag's number, the first of several; ``None`` where it is missing or no number > 0."""
+    """Read an EXIF tag's number, the first of several; ``None`` where it is missing or no number > 0."""
     value = exif.get(tag)
     with suppress(TypeError, ValueError, ZeroDivisionError):
         number = float(value[0] if isinstance(value, tuple) and value else value)
@@ -125,20 +125,20 @@ def positive(exif: Mapping[int, Any], tag: int) -> float | None:
 
 
 def turn(pixels: np.ndarray, orientation: int) -> np.ndarray:
-    """A picture ``[H, W, C]`` as it is to be shown: mirrored, turned or both, as EXIF's orientation says."""
+    """Make a picture ``[H, W, C]`` upright: mirrored, turned or both, by EXIF's orientation."""
     if orientation in (2, 4, 5, 7):
         pixels = pixels[:, ::-1]
     return np.rot90(pixels, {3: 2, 4: 2, 5: 1, 6: -1, 7: -1, 8: 1}.get(orientation, 0))
 
 
 def unpremultiplied(pixels: Float32[np.ndarray, "h w 4"]) -> Float32[np.ndarray, "h w 4"]:
-    """Straight alpha out of colour that has been multiplied by it; colour is 0 where alpha is."""
+    """Turn premultiplied alpha into straight alpha; colour is 0 where alpha is 0."""
     colour, alpha = pixels[..., :3], pixels[..., 3:]
     return np.concatenate([np.divide(colour, alpha, out=np.zeros_like(colour), where=alpha > 0), alpha], axis=-1)
 
 
 def from_light(light: Float[np.ndarray, "h w c"], path: Path) -> Float32[Tensor, "h w c"]:
-    """The picture of linear light: colour through sRGB's curve, alpha as it is. What lies outside [0, 1] stays."""
+    """Encode linear light as sRGB, alpha unchanged; values outside [0, 1] stay outside."""
     if not np.isfinite(light).all():
         raise DataError(path, "NaN or infinity", "finite numbers")
     image = torch.from_numpy(np.ascontiguousarray(light, dtype=np.float32))

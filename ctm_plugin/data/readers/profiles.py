@@ -1,4 +1,4 @@
-"""Colours that a picture's file says are not sRGB's: by an ICC profile, by PNG's gAMA and cICP, or by HEIC's NCLX."""
+"""Colour spaces of picture files other than sRGB: by ICC profile, by PNG's gAMA and cICP, or by HEIC's NCLX."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ class Profile(NamedTuple):
     """An ICC profile.
 
     Attributes:
-        mode: of the pictures that it is of, RGB or L.
+        mode: Pillow's mode of the pictures that it describes, RGB or L.
         to_srgb: LittleCMS's transform of such pictures.
-        off: by how many levels of 255 sRGB differs, at most; taken as linear light, sRGB of it.
+        off, off_as_light: largest difference in levels of 255 from sRGB, and from linear light turned into sRGB.
     """
 
     mode: str
@@ -38,7 +38,7 @@ class Profile(NamedTuple):
 
 @lru_cache(maxsize=16)
 def read_profile(content: bytes) -> Profile | None:
-    """Read an ICC profile; ``None``: it is damaged, or of neither RGB nor grey."""
+    """Read an ICC profile; ``None``: the profile is damaged, or of neither RGB nor grey."""
     try:
         given = ImageCms.ImageCmsProfile(BytesIO(content))
         mode = {"RGB": "RGB", "GRAY": "L"}[given.profile.xcolor_space.strip()]
@@ -56,7 +56,7 @@ def read_profile(content: bytes) -> Profile | None:
 def as_srgb(pixels: UInt8[np.ndarray, "h w c"], content: bytes | None, grey: bool) -> UInt8[np.ndarray, "h w d"]:
     """Convert pixels of 8 bits out of a profile's colours; alpha, the last of two or four channels, stays.
 
-    Without a profile, or with one of sRGB, nothing is done, as where :func:`foreign` tells of it.
+    Pixels stay unchanged without a profile, with sRGB's, or with one that :func:`foreign` names.
     """
     profile = read_profile(content) if content else None
     if profile is None or profile.off <= PROFILE_TOLERANCE or (profile.mode == "L" and not grey):
@@ -69,7 +69,7 @@ def as_srgb(pixels: UInt8[np.ndarray, "h w c"], content: bytes | None, grey: boo
 def foreign(content: bytes | None, grey: bool, deep: bool, light: bool = False) -> str | None:
     """Name a profile whose colours are not converted; ``None``: there is none, or :func:`as_srgb` does.
 
-    LittleCMS's transforms here do not take more than 8 bits a channel, ``deep``; ``light`` is taken for linear.
+    Pictures of more than 8 bits a channel, ``deep``, are not converted; ``light``: the picture is linear light.
     """
     if not content:
         return None
@@ -81,14 +81,14 @@ def foreign(content: bytes | None, grey: bool, deep: bool, light: bool = False) 
 
 
 def png_gamma(image: Image.Image) -> float | None:
-    """Read the power of light that a PNG's numbers are by its gAMA; ``None``: sRGB's curve, or something else tells."""
+    """Read a PNG's gamma, the power of light that it stores, from gAMA; ``None``: sRGB's, or gAMA does not count."""
     gamma = image.info.get("gamma")
     other = image.format != "PNG" or "icc_profile" in image.info or "srgb" in image.info
     return None if other or not gamma or abs(2.2 * gamma - 1) < 0.05 else gamma
 
 
 def png_colours(image: Image.Image) -> str | None:
-    """Name what a PNG's cICP says, unless it is sRGB; Pillow passes it over."""
+    """Name the colours by a PNG's cICP, which Pillow ignores; ``None``: sRGB, or no cICP."""
     if image.format != "PNG" or "icc_profile" in image.info:
         return None
     at = image.fp.tell()
@@ -101,7 +101,7 @@ def png_colours(image: Image.Image) -> str | None:
 
 
 def heif_colours(image: Image.Image) -> str | None:
-    """Name what a HEIC's NCLX says, unless it is sRGB or nearly; a profile goes before it."""
+    """Name the colours by a HEIC's NCLX; ``None``: sRGB or nearly, or there is a profile, which goes before it."""
     nclx = image.info.get("nclx_profile")
     if not nclx or image.info.get("icc_profile"):
         return None

@@ -28,12 +28,12 @@ def open_raw(
     path: Path, brightness: float = 1.0, balance: Sequence[float] | None = None, half: bool = False,
     hot: Bool[np.ndarray, "h w"] | None = None,
 ) -> Iterator[Opened]:  # fmt: skip
-    """A raw picture, developed the same way for every picture of a scene, so that equal light gives equal colours.
+    """Open a raw picture, developed alike for all pictures of a scene, so that equal light gives equal colours.
 
     Black level subtracted, white level to 1, the camera's own white balance, sRGB's primaries; no automatic brightness,
-    no look at what the picture shows; then times ``brightness``, at most 1, and sRGB's curve. Noise below the black
-    level is below 0: cut off, it would leave the dark too bright. The picture stays as the sensor stands: poses are for
-    those.
+    nothing that depends on the picture; then times ``brightness``, at most 1, and sRGB's curve. Noise below the black
+    level is below 0: cut off, it would leave the dark too bright. The picture is not turned: poses are for pictures as
+    the sensor stands.
 
     Args:
         path: the file.
@@ -94,7 +94,7 @@ def open_raw(
 
 
 def require_rawpy() -> ModuleType:
-    """LibRaw as a module."""
+    """Import rawpy, LibRaw's module, or name the extra that is missing."""
     try:
         import rawpy
     except ImportError as error:
@@ -106,8 +106,8 @@ class RawHeader(NamedTuple):
     """Metadata of a raw picture.
 
     Attributes:
-        sensor: rows and columns that it shows.
-        orientation: how it is to be turned, in EXIF's numbers.
+        sensor: height and width in pixels.
+        orientation: the turn that makes it upright, in EXIF's numbers.
         balance: the camera's factors on red, green, blue and the second green.
         exposure: see :func:`exposure_of`.
         lens: by its EXIF.
@@ -121,7 +121,7 @@ class RawHeader(NamedTuple):
 
 
 def read_raw(path: Path) -> RawHeader:
-    """Read what a raw picture says of itself, without developing it."""
+    """Read a raw picture's metadata, without developing it."""
     rawpy = require_rawpy()
     expected = "a raw picture that LibRaw can develop: copy it here again, or leave it out"
     require_file(path, expected)
@@ -132,14 +132,17 @@ def read_raw(path: Path) -> RawHeader:
 
 
 def read_mosaic(path: Path) -> UInt16[np.ndarray, "h w"] | None:
-    """What the sensor of a raw picture measured; ``None``: it has no Bayer pattern."""
+    """Read a sensor's values of a raw picture; ``None``: it has no Bayer pattern."""
     with told(path, "a file that cannot be developed", "a raw picture"), require_rawpy().imread(str(path)) as raw:
         bayer = raw.raw_pattern is not None and raw.raw_pattern.shape == (2, 2)
         return raw.raw_image_visible.copy() if bayer else None
 
 
 def raw_exif(path: Path) -> dict[int, Any]:
-    """A raw picture's own EXIF, which DNG may have on top; nothing of a kind that is no TIFF inside."""
+    """Read a raw picture's EXIF; a DNG may have it in its first directory.
+
+    Empty: the file is not based on TIFF, as most raw formats are.
+    """
     exif = Image.Exif()
     try:
         exif.load(read_bytes(path, "a raw picture"))

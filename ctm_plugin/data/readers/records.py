@@ -19,7 +19,7 @@ from ctm_plugin.settings.setting import Number, is_number
 
 
 class Record:
-    """A JSON object that knows where it stands.
+    """A JSON object with its file and its place there, for checks whose errors name both.
 
     Args:
         values: the object.
@@ -34,38 +34,38 @@ class Record:
         return key in self.values
 
     def place(self, key: str) -> str:
-        """The value's place in the file, for messages."""
+        """Place of a key's value in the file, for messages."""
         return f"{self.where}.{key}" if self.where else key
 
     def fault(self, key: str, expected: str) -> DataError:
-        """The error that tells what stands under ``key`` and what should."""
+        """Make the error that says what stands under ``key`` and what was expected."""
         if key not in self.values:
             return DataError(self.source, f"no {self.place(key)!r}", expected)
         return DataError(self.source, f"{self.place(key)} = {reprlib.repr(self.values[key])}", expected)
 
     def checked(self, key: str, allowed: Callable[[Any], bool], expected: str) -> Any:
-        """Value under ``key``, for which ``allowed`` has to hold; ``None`` where there is none."""
+        """Read the value under ``key``, for which ``allowed`` has to hold; ``None`` where there is none."""
         value = self.values.get(key)
         if not allowed(value):
             raise self.fault(key, expected)
         return value
 
     def number(self, key: str, allowed: Callable[[Number], bool], expected: str) -> float:
-        """A number for which ``allowed`` holds, a bounded interval written as comparisons (NaN then fails them)."""
+        """Read a number for which ``allowed`` holds, a bounded interval written as comparisons (NaN then fails)."""
         return float(self.checked(key, lambda value: is_number(value) and allowed(value), expected))
 
     def text(self, key: str, expected: str) -> str:
-        """A string that is not empty."""
+        """Read a string that is not empty."""
         return self.checked(key, lambda value: isinstance(value, str) and value != "", expected)
 
     def texts(self, key: str, expected: str) -> list[str]:
-        """A list of strings."""
+        """Read a list of strings."""
         return self.checked(
             key, lambda values: isinstance(values, list) and all(isinstance(each, str) for each in values), expected
         )
 
     def records(self, key: str, expected: str) -> list[Record]:
-        """A list of at least one object."""
+        """Read a list of at least one JSON object."""
         values = self.checked(key, lambda value: isinstance(value, list) and len(value) > 0, expected)
         places = [f"{self.place(key)}[{index}]" for index in range(len(values))]
         for place, value in zip(places, values, strict=True):
@@ -74,7 +74,7 @@ class Record:
         return [Record(value, self.source, place) for place, value in zip(places, values, strict=True)]
 
     def matrix(self, key: str, rows: int, columns: int, limit: float) -> Float64[np.ndarray, "rows columns"]:
-        """``rows`` lists of ``columns`` numbers, each below ``limit`` in size."""
+        """Read a matrix, ``rows`` lists of ``columns`` numbers, each below ``limit`` in size."""
         expected = f"{rows} rows of {columns} finite numbers below {limit:g}"
 
         def shaped(value: Any) -> bool:
@@ -89,7 +89,7 @@ class Record:
 
 
 def parse_record(content: bytes, source: Path) -> Record:
-    """The JSON object that a file holds, also where it is the only one of a list, as exiftool writes it."""
+    """Parse a file's JSON object, or the only object of a list, as exiftool writes it."""
     with told(source, "something that is not JSON", "a JSON file"):
         values = json.loads(content)
     values = values[0] if isinstance(values, list) and len(values) == 1 else values
@@ -99,7 +99,7 @@ def parse_record(content: bytes, source: Path) -> Record:
 
 
 def read_record(path: Path) -> Record:
-    """The JSON object in a file, which is parsed again only where it has changed; it is not to be changed here."""
+    """Read the JSON object in a file, cached until the file changes: callers must not change it."""
     require_file(path, "a JSON file")
     state = path.stat()
     return _parsed(path, state.st_mtime_ns, state.st_size)
@@ -111,10 +111,10 @@ def _parsed(path: Path, _changed: int, _size: int) -> Record:
 
 
 def rendered(root: Path, key: str) -> float:
-    """Exposure that our own renderer wrote into a data set's ``settings.json``; 1 for data sets from elsewhere.
+    """Number that this project's renderer wrote into a data set's ``settings.json``; 1 for other data sets.
 
-    ``light`` is the one that it was made with, relative to normal; ``depth_scale`` is scene units in one step of its
-    depth pictures.
+    The key ``light`` is the scene's light relative to normal; ``depth_scale`` is scene units in one step of its depth
+    pictures.
     """
     path = inside(root, "settings.json")
     record = read_record(path) if path.exists() else {}
