@@ -13,8 +13,7 @@ from jaxtyping import Bool
 
 from ctm_plugin.cameras.left_out import DEVELOPED
 from ctm_plugin.cameras.photographs import below
-from ctm_plugin.color.srgb import srgb_to_linear
-from ctm_plugin.data.readers.deep import write_light
+from ctm_plugin.data.readers.deep import write_tiff
 from ctm_plugin.data.readers.folders import RAW_SUFFIXES
 from ctm_plugin.data.readers.hot_pixels import hot_pixels
 from ctm_plugin.data.readers.images import read_picture
@@ -30,7 +29,7 @@ LEAST_OF_A_SENSOR, MOST_OF_A_SENSOR = 5, 12
 
 
 def develop_raws(root: Path) -> None:
-    """Develop the raw pictures in a folder and below it to linear light, EXR of half floats, and print how many.
+    """Develop the raw pictures in a folder and below it to TIFF of 16 bits, and print how many.
 
     All get the white balance of the picture with the median ratio of red to blue. Where exposures differ, shorter ones
     are brightened to the level of the longest. Pixels that are hot in all pictures of a sensor are repaired. All are
@@ -39,7 +38,7 @@ def develop_raws(root: Path) -> None:
     Raises:
         DataError: no picture can be developed.
     """
-    targets = {path: path.parent / DEVELOPED / f"{path.stem}.exr" for path in below(root) if is_raw(path)}
+    targets = {path: path.parent / DEVELOPED / f"{path.stem}.tif" for path in below(root) if is_raw(path)}
     if not targets:
         return
     folders = ", ".join(str(folder) for folder in dict.fromkeys(target.parent for target in targets.values()))
@@ -106,7 +105,7 @@ def _develop(
     def decode(path: Path) -> object:
         return open_raw(path, brightness, balance, max(header.sensor) > HALF_SIZE_SIDE, hot)
 
-    light = srgb_to_linear(read_picture(path, decode).image()).numpy()
+    codes = read_picture(path, decode).image().numpy()
     target.parent.mkdir(exist_ok=True)
     with replacing(target) as beside:
-        write_light(beside, light, header.orientation, header.lens)
+        write_tiff(beside, (codes * 65535).round().astype(np.uint16), header.orientation, header.lens)

@@ -52,11 +52,11 @@ def develop(
     pictures: Sequence[PictureFile | None], names: Sequence[str], config: PhotoConfig, noisy: bool,
     canvas: tuple[int, int], deep: bool = False,
 ) -> Pixels:  # fmt: skip
-    """The images ``[N, H, W, C]`` of one split: read, shrunk, clipped to [0, 1], dimmed, given noise and rounded.
+    """The images ``[N, H, W, C]`` of one split: read, clipped to [0, 1], shrunk, dimmed, given noise and rounded.
 
     Alpha is only shrunk. 8 bits are kept in uint8, more in float32, which is not rounded. Where only some have alpha
-    the others are opaque, where only some are deep, or with ``deep``, all are. Light above 1 is clipped, with one
-    warning; below 0 when it has been shrunk.
+    the others are opaque, where only some are deep, or with ``deep``, all are. Linear light outside [0, 1] is clipped,
+    with one warning.
 
     Pictures that are not there are black, without any alpha; one is there at least. Noise is decided by the seed and
     the view's name. ``canvas`` is the height and width in whose upper left corner
@@ -81,10 +81,9 @@ def develop(
 
     def fill(index: int) -> None:
         image = pictures[index].image()
-        if image.amax() > 1:
+        if image.amin() < 0 or image.amax() > 1:
             clipped.append(pictures[index].path.name)
-        # Noise below black is cut off last: its mean over a pixel is that of the light.
-        image = shrink(image.clamp_(max=1.0), *config.shrunk(*image.shape[:2])).clamp_(min=0.0)
+        image = shrink(image.clamp_(0.0, 1.0), *config.shrunk(*image.shape[:2]))
         colour, alpha = image[..., :3], image[..., 3:]
         if config.exposure != 1:
             colour = brighten(colour, config.exposure, "hard")
@@ -102,7 +101,7 @@ def develop(
     with ThreadPoolExecutor(at_once) as pool:
         list(pool.map(fill, there))
     if clipped:
-        note = f"{len(clipped)} of {len(there)} pictures have light above 1, which is clipped"
+        note = f"{len(clipped)} of {len(there)} pictures have light outside [0, 1], which is clipped"
         warnings.warn(f"{folder}: {note}, such as {min(clipped)}", stacklevel=2)
     return images
 

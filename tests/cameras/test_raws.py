@@ -33,36 +33,30 @@ def test_all_have_the_light_of_the_longest(night, capsys):
     folder = night / "developed"
     told = "3 raw pictures developed with one white balance, exposures evened by up to 4 times"
     assert capsys.readouterr().out == f"{told}: {folder}\n"
-    expected = linear_to_srgb(read_image(folder / "IMG_0.exr").new_tensor(camera_to_srgb(COLOR)))
+    expected = linear_to_srgb(read_image(folder / "IMG_0.tif").new_tensor(camera_to_srgb(COLOR)))
     for number in range(3):
-        assert (read_image(folder / f"IMG_{number}.exr") - expected).abs().max() < 3e-3
-        header = read_picture(folder / f"IMG_{number}.exr").header
+        assert (read_image(folder / f"IMG_{number}.tif") - expected).abs().max() < 3e-3
+        header = read_picture(folder / f"IMG_{number}.tif").header
         assert (header.deep, header.orientation, header.height, header.width) == (True, 6, 48, 32)
 
 
-def test_hot_pixels_are_repaired_and_noise_goes_below_black(tmp_path, capsys):
-    """Of what is black but for noise the mean light is 0; cut off, it would be 0.4 of the noise."""
-    rng = np.random.default_rng(0)
+def test_hot_pixels_are_repaired(tmp_path, capsys):
     for number in range(6):
-        sensor = rng.normal(0, 0.004, (48, 64, 3))
+        sensor = np.random.default_rng(number).normal(0.02, 0.004, (48, 64, 3))
         sensor[20, 30] = 0.5
         write_dng(tmp_path / f"{number}.dng", sensor)
     develop_raws(tmp_path)
-    assert capsys.readouterr().out.startswith(
-        "6 raw pictures developed with one white balance, 1 hot pixels repaired: "
-    )
+    said = "6 raw pictures developed with one white balance, 1 hot pixels repaired: "
+    assert capsys.readouterr().out.startswith(said)
     for path in (tmp_path / "developed").iterdir():
-        light = srgb_to_linear(read_image(path)).numpy()
-        assert light.min() < -0.004
-        assert np.abs(light.mean((0, 1))).max() < 4 * 0.004 * 3 / np.sqrt(48 * 64 / 4)
-        assert light.max() < 0.04
+        assert srgb_to_linear(read_image(path)).max() < 0.1
 
 
 def test_the_lens_is_told(tmp_path):
     for name in "abc":
         write_dng(tmp_path / f"{name}.dng", flat(COLOR))
     develop_raws(tmp_path)
-    assert read_picture(tmp_path / "developed" / "a.exr").header.lens == Lens("Test", "Test")
+    assert read_picture(tmp_path / "developed" / "a.tif").header.lens == Lens("Test", "Test")
 
 
 def test_they_are_used_again_and_go_before_the_cameras_own_jpeg(night, capsys):
@@ -76,7 +70,7 @@ def test_they_are_used_again_and_go_before_the_cameras_own_jpeg(night, capsys):
     assert {path: path.stat().st_mtime_ns for path in (night / "developed").iterdir()} == before
     assert "3 pictures in" in capsys.readouterr().out.splitlines()[-1]
     for number in range(3):  # as if each showed something else
-        path = night / "developed" / f"IMG_{number}.exr"
+        path = night / "developed" / f"IMG_{number}.tif"
         path.write_bytes(path.read_bytes() + bytes(number))
     with pytest.warns(UserWarning, match="1 copies are left out, as 'IMG_1.JPG'"):
         assert list_photographs(night, "images") == sorted(before)

@@ -9,7 +9,8 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float32
+from jaxtyping import UInt16
+from PIL.ExifTags import Base
 from torch import Tensor
 
 from ctm_plugin.data.readers.folders import require_file, told
@@ -19,6 +20,7 @@ from ctm_plugin.data.readers.picture import (
     Opened,
     check_size,
     from_light,
+    lens_of,
     unpremultiplied,
     upright_header,
 )
@@ -30,8 +32,11 @@ EXPECTED = (
     f"{MAX_PIXELS} pixels: copy it here again, or leave it out"
 )
 GREY, COLOUR = (("Y",), ("Y", "A")), (("R", "G", "B"), ("R", "G", "B", "A"))
-LENS_NAMES = ("Make", "Model", "Exif:FocalLength", "Exif:FocalLengthIn35mmFilm", "Exif:DigitalZoomRatio")
-"""OpenImageIO's names of what :class:`Lens` has."""
+LENS_NAMES = {
+    Base.Make: "Make", Base.Model: "Model", Base.FocalLength: "Exif:FocalLength",
+    Base.FocalLengthIn35mmFilm: "Exif:FocalLengthIn35mmFilm", Base.DigitalZoomRatio: "Exif:DigitalZoomRatio",
+}  # fmt: skip
+"""OpenImageIO's names of EXIF's tags, in the order of :class:`Lens`."""
 WHOLE, LIGHT = ("uint8", "uint16"), ("half", "float", "double")
 """OpenImageIO's names of the number types of stored levels, and of those of linear light."""
 
@@ -66,17 +71,18 @@ def colored(pixels: np.ndarray) -> np.ndarray:
     return pixels if pixels.shape[-1] > 2 else pixels[..., [0, 0, 0, *range(1, pixels.shape[-1])]]
 
 
-def write_light(path: Path, light: Float32[np.ndarray, "h w 3"], orientation: int, lens: Lens) -> None:
-    """Write linear light as EXR of half floats, to be turned by EXIF's orientation; the lens by its EXIF's names."""
+def write_tiff(path: Path, codes: UInt16[np.ndarray, "h w 3"], orientation: int, lens: Lens) -> None:
+    """Write sRGB of 16 bits, with EXIF's orientation and lens."""
     import OpenImageIO as oiio
 
-    spec = oiio.ImageSpec(light.shape[1], light.shape[0], 3, "half")
-    for name, value in (("Orientation", orientation), *zip(LENS_NAMES, lens, strict=True)):
+    spec = oiio.ImageSpec(codes.shape[1], codes.shape[0], 3, "uint16")
+    lens = lens._replace(film=lens.film and round(lens.film))  # EXIF has whole millimetres
+    for name, value in (("Orientation", orientation), *zip(LENS_NAMES.values(), lens, strict=True)):
         if value is not None:
             spec.attribute(name, value)
-    file = oiio.ImageOutput.create("openexr")
-    if file is None or not (file.open(str(path), spec) and file.write_image(light) and file.close()):
-        raise OSError(oiio.geterror() if file is None else file.geterror())
+    file = oiio.ImageOutput.create("tiff")
+    if not (file.open(str(path), spec) and file.write_image(codes) and file.close()):
+        raise OSError(file.geterror())
 
 
 @contextmanager
@@ -107,5 +113,5 @@ def open_deep(path: Path) -> Iterator[Opened]:
                 stored = unpremultiplied(stored)
             return from_light(stored, path) if light else torch.from_numpy(stored).clamp_(max=1.0)
 
-        lens = Lens(*map(spec.getattribute, LENS_NAMES))
-        yield Opened(header._replace(colours=foreign(profile, grey, deep, light), lens=lens), pixels)
+        tags = {tag: value for tag, name in LENS_NAMES.items() if (value := spec.getattribute(name)) is not None}
+        yield Opened(header._replace(colours=foreign(profile, grey, deep, light), lens=lens_of(tags, tags)), pixels)

@@ -31,9 +31,8 @@ def open_raw(
     """Open a raw picture, developed alike for all pictures of a scene, so that equal light gives equal colours.
 
     Black level subtracted, white level to 1, the camera's own white balance, sRGB's primaries; no automatic brightness,
-    nothing that depends on the picture; then times ``brightness``, at most 1, and sRGB's curve. Noise below the black
-    level is below 0: cut off, it would leave the dark too bright. The picture is not turned: poses are for pictures as
-    the sensor stands.
+    nothing that depends on the picture; then times ``brightness``, clipped, and sRGB's curve. The picture is not
+    turned: poses are for pictures as the sensor stands.
 
     Args:
         path: the file.
@@ -50,44 +49,22 @@ def open_raw(
         check_size(path, sizes.raw_width, sizes.raw_height, expected)
 
         def pixels() -> Tensor:
-            given = raw.camera_whitebalance if balance is None else balance
-            factors = np.array(given if any(given) else raw.daylight_whitebalance, float)
-            black = np.array(raw.black_level_per_channel)
-            lift, top = black.max(), raw.white_level - black.max()
-            lifted = raw.raw_type == rawpy.RawType.Flat and lift > 0
-
-            def developed(half: bool) -> np.ndarray:
-                return raw.postprocess(
-                    user_wb=[*factors],
-                    half_size=half,
-                    output_color=rawpy.ColorSpace.sRGB,
-                    output_bps=16,
-                    gamma=(1, 1),
-                    no_auto_bright=True,
-                    adjust_maximum_thr=0.0,
-                    user_flip=0,
-                    **({"user_black": 0, "user_sat": int(top + lift)} if lifted else {}),
-                )
-
             if hot is not None:
                 repair(raw.raw_image_visible, hot)
-            zero, scale = [0, 0, 0], 1 / 65535
-            if lifted:
-                # LibRaw cuts off what is below black: black becomes a grey, after the balance, that is taken off later.
-                mosaic, colors = raw.raw_image_visible, raw.raw_colors_visible
-                grey = np.round(lift * factors[factors > 0].min() / np.where(factors > 0, factors, factors[1]))
-                shift = (grey - black).astype(np.int32)
-                mosaic[:] = (mosaic + shift[colors]).clip(0, 65535)
-                scale *= (top + lift) / top
-            codes = developed(half)
-            if lifted:
-                mosaic[:] = grey[colors]
-                zero = np.median(developed(True), (0, 1))
-            levels = torch.arange(65536, dtype=torch.float32)
-            light = [((levels - level) * (scale * brightness)).clamp(max=1.0) for level in zero]
-            # Tables: all pixels' light in float would take a gigabyte.
-            channels = [linear_to_srgb(each).numpy()[codes[..., index]] for index, each in enumerate(light)]
-            return torch.from_numpy(np.stack(channels, -1))
+            linear = raw.postprocess(
+                use_camera_wb=balance is None,
+                user_wb=None if balance is None else [*balance],
+                half_size=half,
+                output_color=rawpy.ColorSpace.sRGB,
+                output_bps=16,
+                gamma=(1, 1),
+                no_auto_bright=True,
+                adjust_maximum_thr=0.0,
+                user_flip=0,
+            )
+            levels = torch.arange(65536, dtype=torch.float32) / 65535.0
+            table = linear_to_srgb((levels * brightness).clamp(max=1.0))
+            return torch.from_numpy(table.numpy()[linear])  # all pixels' light in float would take a gigabyte
 
         height, width = ((side + half) // (1 + half) for side in (sizes.height, sizes.width))
         yield Opened(Header(height, width, alpha=False, deep=True), pixels)
