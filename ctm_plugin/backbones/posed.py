@@ -55,6 +55,8 @@ class PosedBackbone(Backbone):
     """Geometries that it can train on; ``dataset.geometry=auto`` chooses among them."""
     relative = False
     """Whether photometric terms are divided by 12 times the variance of the training colours."""
+    max_scale = 1.0
+    """Largest factor by which films are wider than the training's pictures."""
 
     def __init__(
         self, scene: Scene, batch_rays: int, transform: ColorTransform | None = None,
@@ -264,7 +266,7 @@ class PosedBackbone(Backbone):
                 pictures["depth"] = depth_picture(view["depth"], scene.near, scene.far)
                 pictures["latent"] = latent_picture(view["latent"])
                 for kind, picture in pictures.items() if folder else ():
-                    write_png(folder / kind / f"{views.names[index]}.png", picture)
+                    write_png(folder / kind / f"{views.names[index]}.png", views.own(index, picture))
             result = summarize(
                 views.names,
                 rendered,

@@ -28,5 +28,6 @@ class Preview(L.Callback):
             photo = pl_module.target(index)
             with untouched(pl_module):
                 rendered = pl_module.render_view(pl_module.scene.test, index)["rgb"].float().cpu()
-            write_png(path, beside(*(light.apply(each) for each in (rendered, photo) if each is not None)))
+            both = [pl_module.scene.test.own(index, each) for each in (rendered, photo) if each is not None]
+            write_png(path, beside(*map(light.apply, both)))
             say(f"preview: {path}")

@@ -10,10 +10,8 @@ from pathlib import Path
 from statistics import median
 from typing import NamedTuple
 
-from PIL.ExifTags import Base
-
 from ctm_plugin.data.readers.folders import PHONE_SUFFIXES, fold
-from ctm_plugin.data.readers.images import DECODERS, open_usual, opened, read_picture
+from ctm_plugin.data.readers.images import read_picture
 from ctm_plugin.errors import CTMError
 
 SUFFIX_ORDER = (".exr", ".tif", ".tiff", *PHONE_SUFFIXES, ".png", ".webp", ".jpg", ".jpeg")
@@ -52,14 +50,9 @@ def looks_of(path: Path) -> Looks | None:
     """Read a picture's header; ``None``: it cannot be read, which the later reading of the file reports."""
     try:
         header = read_picture(path).header
-        camera = False
-        if DECODERS.get(path.suffix.lower(), open_usual) is open_usual:
-            with opened(path) as image:
-                exif = image.getexif()
-                camera = bool(exif.get(Base.Make) or exif.get(Base.Model))
     except CTMError:
         return None
-    return Looks(path, (max(header[:2]), min(header[:2])), camera)
+    return Looks(path, (max(header[:2]), min(header[:2])), bool(header.lens.maker or header.lens.model))
 
 
 def left_out(paths: Sequence[Path]) -> dict[str, list[Path]]:

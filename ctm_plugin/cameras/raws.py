@@ -3,30 +3,37 @@
 from __future__ import annotations
 
 import warnings
+from collections import defaultdict
+from collections.abc import Mapping
 from pathlib import Path
 from statistics import median_low
 
 import numpy as np
-import tifffile
+from jaxtyping import Bool
 
 from ctm_plugin.cameras.left_out import DEVELOPED
 from ctm_plugin.cameras.photographs import below
+from ctm_plugin.data.readers.deep import write_tiff
 from ctm_plugin.data.readers.folders import RAW_SUFFIXES
+from ctm_plugin.data.readers.hot_pixels import hot_pixels
 from ctm_plugin.data.readers.images import read_picture
-from ctm_plugin.data.readers.raw import RawHeader, open_raw, read_raw
+from ctm_plugin.data.readers.raw import RawHeader, open_raw, read_mosaic, read_raw
 from ctm_plugin.errors import DataError
 from ctm_plugin.files import replacing
 from ctm_plugin.show.bars import bar
 
 HALF_SIZE_SIDE = 3000
 """Longer side in pixels from which a raw picture is developed at half its size."""
+LEAST_OF_A_SENSOR, MOST_OF_A_SENSOR = 5, 12
+"""Pictures of a sensor that its hot pixels are looked for in, at least and at most."""
 
 
 def develop_raws(root: Path) -> None:
     """Develop the raw pictures in a folder and below it to TIFF of 16 bits, and print how many.
 
     All get the white balance of the picture with the median ratio of red to blue. Where exposures differ, shorter ones
-    are brightened to the level of the longest. All are developed anew unless all developed files exist.
+    are brightened to the level of the longest. Pixels that are hot in all pictures of a sensor are repaired. All are
+    developed anew unless all developed files exist.
 
     Raises:
         DataError: no picture can be developed.
@@ -54,13 +61,17 @@ def develop_raws(root: Path) -> None:
     redness = {path: header.balance[0] / max(header.balance[2], 1e-6) for path, header in headers.items()}
     middle = median_low(redness.values())
     balance = next(headers[path].balance for path, ratio in redness.items() if ratio == middle)
+    hot = find_hot(headers)
     with bar("developed", len(headers)) as done:
         for number, (path, header) in enumerate(headers.items(), 1):
             brightness = max(exposures) / header.exposure if known else 1.0
-            _develop(path, targets[path], header, brightness, balance)
+            _develop(path, targets[path], header, brightness, balance, hot[sensor_of(header)])
             done(number, path.name)
-    evened = f", exposures evened by up to {max(exposures) / min(exposures):.3g} times" if known else ""
-    print(f"{len(headers)} raw pictures developed with one white balance{evened}: {folders}")
+    spread = max(exposures) / min(exposures) if known else 1.0
+    evened = f", exposures evened by up to {spread:.3g} times" if spread > 1.01 else ""
+    count = sum(int(each.sum()) for each in hot.values() if each is not None)
+    repaired = f", {count} hot pixels repaired" if count else ""
+    print(f"{len(headers)} raw pictures developed with one white balance{evened}{repaired}: {folders}")
 
 
 def is_raw(path: Path) -> bool:
@@ -68,12 +79,33 @@ def is_raw(path: Path) -> bool:
     return path.suffix.lower() in RAW_SUFFIXES
 
 
-def _develop(path: Path, target: Path, header: RawHeader, brightness: float, balance: tuple[float, ...]) -> None:
+def sensor_of(header: RawHeader) -> tuple[object, ...]:
+    """What pictures of one sensor share."""
+    return header.lens.maker, header.lens.model, header.sensor
+
+
+def find_hot(headers: Mapping[Path, RawHeader]) -> dict[tuple[object, ...], Bool[np.ndarray, "h w"] | None]:
+    """Each sensor's hot pixels, by some of its pictures; ``None``: there are too few, or it has no Bayer pattern."""
+    sensors = defaultdict(list)
+    for path, header in headers.items():
+        sensors[sensor_of(header)].append(path)
+    hot = {}
+    for sensor, paths in sensors.items():
+        chosen = paths[:: -(-len(paths) // MOST_OF_A_SENSOR)]
+        mosaics = map(read_mosaic, chosen)
+        usual = len(chosen) >= LEAST_OF_A_SENSOR and read_mosaic(chosen[0]) is not None
+        hot[sensor] = hot_pixels(mosaics) if usual else None
+    return hot
+
+
+def _develop(
+    path: Path, target: Path, header: RawHeader, brightness: float, balance: tuple[float, ...],
+    hot: Bool[np.ndarray, "h w"] | None,
+) -> None:  # fmt: skip
     def decode(path: Path) -> object:
-        return open_raw(path, brightness, balance, header.side > HALF_SIZE_SIDE)
+        return open_raw(path, brightness, balance, max(header.sensor) > HALF_SIZE_SIDE, hot)
 
     codes = read_picture(path, decode).image().numpy()
-    turned = [(274, "H", 1, header.orientation, True)]
     target.parent.mkdir(exist_ok=True)
     with replacing(target) as beside:
-        tifffile.imwrite(beside, (codes * 65535).round().astype(np.uint16), photometric="rgb", extratags=turned)
+        write_tiff(beside, (codes * 65535).round().astype(np.uint16), header.orientation, header.lens)

@@ -21,6 +21,7 @@ from ctm_plugin.cameras.lenses import tell_lenses_apart
 from ctm_plugin.cameras.pairs import VOTERS, all_pairs, likely_pairs
 from ctm_plugin.cameras.refine import Light, blurred, refine
 from ctm_plugin.cameras.settings import MIN_PICTURES, CamerasConfig
+from ctm_plugin.cameras.sharpness import unsharp
 from ctm_plugin.cameras.trust import Trusted, trusted
 from ctm_plugin.color.light import LUMINANCE, brighten, factor_to_mean
 from ctm_plugin.color.srgb import linear_to_srgb, srgb_to_linear
@@ -76,15 +77,21 @@ def find_cameras(
     Keypoints are plain SIFT first; with too few observations, SIFT pooled over sizes (J. Dong and S. Soatto,
     Domain-size pooling in local descriptors, CVPR 2015); then a network's, if it is installed: at once where too few
     pictures get a pose. Of several models the one with most observations is taken, and refined. Keypoints and
-    matches are kept in ``folder``: those that are there already are used.
+    matches are kept in ``folder``: those that are there already are used. Pictures far less sharp than their
+    neighbours are left out.
 
     Raises:
         DataError: too few pictures get a pose, or they have too few observations.
     """
     paths, headers, gain, best = [each.path for each in pictures], [each.header for each in pictures], 1.0, Trusted()
-    pairs = all_pairs(len(paths)) if len(paths) <= settings.all_pairs else []
     with ThreadPoolExecutor(None if settings.threads < 0 else settings.threads) as pool:
         lights = list(with_progress("brightness", pool.map(partial(read_light, size=settings.size), pictures), paths))
+        sensors = [(header.lens, *sorted(header[:2])) for header in headers]
+        if soft := unsharp([each.light.numpy() for each in lights], sensors):
+            say(f"{len(soft)} pictures far less sharp than their neighbours are left out, as {names[soft[0]]!r}")
+            kept = [number for number in range(len(names)) if number not in soft]
+            paths, headers, lights, names = ([each[i] for i in kept] for each in (paths, headers, lights, names))
+        pairs = all_pairs(len(paths)) if len(paths) <= settings.all_pairs else []
         if settings.brighten:
             gain = find_gain([as_grey(each.light[::THINNING, ::THINNING]) for each in lights])
         rungs = [SIFT, POOLED, LEARNED] if has_network() else [SIFT, POOLED]

@@ -11,7 +11,8 @@ from ctm_plugin.data.llff import LLFFConfig
 from ctm_plugin.data.readers.folders import RAW_SUFFIXES, fold, folded, inside
 from ctm_plugin.data.readers.images import read_picture
 from ctm_plugin.data.readers.layouts import open_layout
-from ctm_plugin.data.readers.raw import open_raw, raw_exposure
+from ctm_plugin.data.readers.picture import exposure_of
+from ctm_plugin.data.readers.raw import open_raw, raw_exif
 from ctm_plugin.data.readers.records import read_record
 from ctm_plugin.data.settings import RawNeRFSettings
 from ctm_plugin.errors import DataError
@@ -63,7 +64,7 @@ def relative_brightness(records: list[Path], raws: list[Path]) -> list[float]:
     missing = [record for record in records if not record.exists()]
     if missing and len(missing) < len(records):
         raise DataError(missing[0], "no such file", "EXIF data for each raw picture, or for none")
-    exposures = [raw_exposure(raw) for raw in raws] if missing else [exposure(record) for record in records]
+    exposures = [exposure_of(raw_exif(raw)) for raw in raws] if missing else [exposure(record) for record in records]
     return [1.0] * len(raws) if None in exposures else [max(exposures) / each for each in exposures]
 
 

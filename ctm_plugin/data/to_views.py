@@ -59,6 +59,7 @@ def develop_photographs(capture: Capture, config: BoundsConfig) -> tuple[Views, 
                 depth=develop_depth(depths, capture.depth_scale, *canvas) if depths and not noisy else None,
                 lit=None if noisy else develop_lit(taken, photo, own, canvas),
                 exposures=exposures_told([headers[i] for i in chosen]) if noisy else None,
+                sizes=torch.tensor(own) if {*sizes} != {canvas} else None,
             )
         )
     train, test = views
@@ -130,8 +131,15 @@ def camera_of(photograph: Photograph, header: Header, source: Path) -> Intrinsic
 
 
 def exposures_told(headers: Sequence[Header]) -> Float32[Tensor, " n"] | None:
-    """The pictures' exposures ``[N]`` by their EXIF; NaN where EXIF does not give one, ``None`` where none does."""
+    """The pictures' exposures ``[N]`` by their EXIF; NaN where EXIF does not give one, ``None`` where none does.
+
+    Those of several cameras, whose own factors differ, are relative to the median of each camera's.
+    """
     exposures = torch.tensor([math.nan if header.exposure is None else header.exposure for header in headers])
+    cameras = [header.lens[:2] for header in headers]
+    for camera in {*cameras} if len({*cameras}) > 1 else ():
+        own = torch.tensor([each == camera for each in cameras])
+        exposures[own] /= exposures[own].nanmedian()
     return None if exposures.isnan().all() else exposures
 
 

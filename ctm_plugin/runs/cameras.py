@@ -52,6 +52,7 @@ def _note(views: Views) -> dict[str, Any]:
         "size": [views.height, views.width, views.images.shape[3]],
         "bytes": views.images.dtype == torch.uint8,
         "names": list(views.names),
+        "sizes": None if views.sizes is None else views.sizes.tolist(),
         "mask": mask,
         **{name: None if table is None else table.tolist() for name, table in tables.items()},
     }
@@ -95,6 +96,10 @@ def _views(note: Any, dark: Any) -> Views:
     # Files are named by them.
     _check(all(isinstance(name, str) and Path(name).name == name and "\\" not in name for name in names), "names")
     _check(0 < len(set(names)) == count, "names")
+    own = note.get("sizes")  # older versions have none
+    if own is not None:
+        own = _table(own, count, 2).long()
+        _check(bool(((own > 0) & (own <= torch.tensor([height, width]))).all()), "sizes")
     level = torch.full((1,), float(not dark)) * (255 if note["bytes"] else 1)
     level = level.byte() if note["bytes"] else level
     if mask is not None:
@@ -104,6 +109,7 @@ def _views(note: Any, dark: Any) -> Views:
         images=level.expand(count, height, width, channels),
         names=tuple(names),
         mask=mask,
+        sizes=own,
         pictured=torch.zeros(count, dtype=torch.bool),
         **{key: None if note[key] is None else _table(note[key], count, *size).float() for key, size in sizes.items()},
     )

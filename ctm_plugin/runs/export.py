@@ -16,7 +16,7 @@ from ctm_plugin.data.readers.images import to_8_bits
 from ctm_plugin.errors import ConfigError
 from ctm_plugin.files import replacing_folder
 from ctm_plugin.runs.captures import Dots, write_capture
-from ctm_plugin.runs.load import load_posed
+from ctm_plugin.runs.load import LoadedRun, load_posed
 from ctm_plugin.runs.page import write_page
 from ctm_plugin.runs.rundir import ALL, PAGE
 from ctm_plugin.runs.settings import ExportConfig
@@ -58,7 +58,7 @@ def export(run: Path, settings: ExportConfig) -> None:
         place = (Path(settings.out) if settings.out else run) / PAGE
         if not settings.overwrite:
             check_new([place])
-        export_page(run, place, settings)
+        export_page(run, load_posed(run, settings.dataset.root, pictures=False), place, settings)
         print_file("written to ", place)
         return
     posed = load_posed(run, settings.dataset.root, pictures=settings.photographs)
@@ -89,20 +89,20 @@ def export(run: Path, settings: ExportConfig) -> None:
         print_next("view", run)
 
 
-def export_page(run: Path, path: Path, settings: ExportConfig) -> None:
+def export_page(run: Path, posed: LoadedRun, path: Path, settings: ExportConfig) -> None:
     """Write a run's HTML page to ``path``."""
-    posed = load_posed(run, settings.dataset.root, pictures=False)
     write_page(path, run, posed, chosen_light(settings, posed.light))
 
 
-def write_views(run: Path) -> None:
+def write_views(run: Path, posed: LoadedRun) -> None:
     """Write every photograph's view, lit: ``all/NAME.png``."""
-    posed = load_posed(run, pictures=False)
     module, scene = posed.module, posed.module.scene
     every = [(views, index) for views in (scene.train, scene.test) for index in range(len(views))]
     with replacing_folder(run / ALL) as folder, fast_products(module.device):
         for views, index in tracked(every, ALL):
-            write_png(folder / f"{views.names[index]}.png", lit_view(module, views, index, posed.light))
+            write_png(
+                folder / f"{views.names[index]}.png", views.own(index, lit_view(module, views, index, posed.light))
+            )
 
 
 def write_lit(path: Path, module: Splat, light: Light) -> None:

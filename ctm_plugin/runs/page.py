@@ -57,9 +57,10 @@ WITHOUT_VIEWER = "To walk through the scene, the page needs viser when it is mad
 
 
 class PageView(NamedTuple):
-    """A test view as data URLs: lit; the photograph as it was, and in the same light, where there is one."""
+    """A test view: width and height; data URLs of it lit, and of the photograph as it was and lit, if there is one."""
 
     name: str
+    size: tuple[int, int]
     lit: str
     taken: str | None
     photo: str | None
@@ -132,7 +133,7 @@ def facts(posed: LoadedRun, light: Light, scores: Mapping[str, Any]) -> list[str
 
 
 def shots_of(module: PosedBackbone, light: Light) -> tuple[list[PageView], tuple[int, int]]:
-    """Test views, evenly chosen, rendered and photographed, as large as the page has room, and their size."""
+    """Test views, evenly chosen, rendered and photographed, as large as the page has room, and the film's size."""
     views = module.scene.test
     chosen = np.unique(np.linspace(0, len(views) - 1, min(MAX_VIEWS, len(views))).round().astype(int)).tolist()
     if len(chosen) < len(views):
@@ -142,7 +143,7 @@ def shots_of(module: PosedBackbone, light: Light) -> tuple[list[PageView], tuple
         photograph = module.target(index)
         kinds = [lit_view(module, views, index, light).cpu()]
         kinds += [] if photograph is None else [photograph, light.apply(photograph)]
-        pictures.append([Image.fromarray(to_8_bits(each).numpy()) for each in kinds])
+        pictures.append([Image.fromarray(to_8_bits(views.own(index, each)).numpy()) for each in kinds])
     width = min(MAX_WIDTH, views.width)
     while True:
         files = [[webp(each, width) for each in kinds] for kinds in pictures]
@@ -152,10 +153,15 @@ def shots_of(module: PosedBackbone, light: Light) -> tuple[list[PageView], tuple
     if width < views.width:
         print(f"the page's pictures are {width} pixels wide, of {views.width}: it is to have less than {LIMIT:,} bytes")
     shots = [
-        PageView(views.names[index], *[url("image/webp", each) for each in kinds], *[None] * (3 - len(kinds)))
+        PageView(
+            views.names[index],
+            views.size(index)[::-1],
+            *[url("image/webp", each) for each in kinds],
+            *[None] * (3 - len(kinds)),
+        )
         for index, kinds in zip(chosen, files, strict=True)
     ]
-    return shots, (width, round(width * views.height / views.width))
+    return shots, views.size(views.largest)[::-1]
 
 
 def webp(picture: Image.Image, width: int) -> bytes:

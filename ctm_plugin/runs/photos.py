@@ -60,6 +60,7 @@ def photos(folder: Path, settings: PhotosConfig, others: Sequence[str] = ()) -> 
     # These take seconds to import: what lies in the folder is refused before.
     from ctm_plugin.cameras.command import place, tell
     from ctm_plugin.runs.export import export_page, write_views
+    from ctm_plugin.runs.load import load_posed
     from ctm_plugin.runs.train import resume, train
     from ctm_plugin.runs.video import film
     from ctm_plugin.show.console import output_console, print_file, print_next
@@ -81,12 +82,15 @@ def photos(folder: Path, settings: PhotosConfig, others: Sequence[str] = ()) -> 
             train(compose(*choices(root, settings.minutes, others, say)), run, lambda *_: None)
         elif not (run / METRICS).exists():
             resume(run, lambda *_: None)
-        video = film_of(run) or film(run, VideoConfig())
-        if not (run / ALL).exists():
-            write_views(run)
-        if not (run / PAGE).exists():
-            export_page(run, run / PAGE, ExportConfig(what="page"))
-    say(f"lit views: {run / ALL}\nfilm:      {video}\nscores:    {run / METRICS}")
+        if not (film_of(run) and (run / ALL).exists() and (run / PAGE).exists()):
+            posed = load_posed(run, pictures=False)
+            if not film_of(run):
+                film(run, posed, VideoConfig())
+            if not (run / ALL).exists():
+                write_views(run, posed)
+            if not (run / PAGE).exists():
+                export_page(run, posed, run / PAGE, ExportConfig(what="page"))
+    say(f"lit views: {run / ALL}\nfilm:      {film_of(run)}\nscores:    {run / METRICS}")
     print_file("all of it: ", run / PAGE)
     print_next("view", run)
 

@@ -13,14 +13,13 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from ctm_plugin.backbones.posed import PosedBackbone
-from ctm_plugin.backbones.splat import Splat
 from ctm_plugin.color.light import AS_IS, Light, chosen_light
 from ctm_plugin.cpu.products import fast_products
 from ctm_plugin.data.readers.key_frames import read_key_frames
 from ctm_plugin.data.rig import SURROUND_DEGREES, turn
 from ctm_plugin.errors import ConfigError
 from ctm_plugin.files import replacing
-from ctm_plugin.runs.load import load_posed
+from ctm_plugin.runs.load import LoadedRun, load_posed
 from ctm_plugin.runs.settings import VideoConfig, can_mp4
 from ctm_plugin.scene.camera_paths import KeyFrames, capture, orbit, spiral
 from ctm_plugin.scene.views import Scene, Views
@@ -33,11 +32,8 @@ BT709_TAGS = ":".join(f"{key}=bt709" for key in ("colorspace", "color_primaries"
 FFMPEG_BT709 = ["-vf", f"scale=out_color_matrix=bt709:out_range=tv,setparams={BT709_TAGS}", "-movflags", "+faststart"]
 """ffmpeg's arguments: BT.709's colours, tagged as such, and the index at the file's beginning."""
 
-FILM_WIDTH, MAX_SCALE = 1280, 2.0
-"""Width in pixels that films of splats reach, at most so many times the training's: there they are 0.05 dB closer to
-larger photographs than enlarged pictures are (RealX3D's MilkCookie, trained 300 pixels wide)."""
-MIN_PRINCIPAL = 0.9
-"""Principal point's coordinate, as a share of the picture's middle, below which the picture lies on a larger canvas."""
+FILM_WIDTH = 1280
+"""Width in pixels that films reach where a backbone renders pixels finer than the training's."""
 
 
 def render(run: Path, settings: VideoConfig) -> None:
@@ -51,18 +47,17 @@ def render(run: Path, settings: VideoConfig) -> None:
         CTMError: the folder is no run, its checkpoint cannot be used, it is not of a scene with cameras, or a film is
             there already.
     """
-    out = film(run, settings)
+    out = film(run, load_posed(run, settings.dataset.root, pictures=False), settings)
     print(f"written to {out}")
     print_next("view", run)
 
 
-def film(run: Path, settings: VideoConfig) -> Path:
+def film(run: Path, posed: LoadedRun, settings: VideoConfig) -> Path:
     """Write a film, see :func:`render`.
 
     Returns:
         The film's file.
     """
-    posed = load_posed(run, settings.dataset.root, pictures=False)
     module, scene = posed.module, posed.module.scene
     path = settings.path or ("orbit" if turn(scene.train.c2w.cpu().double().numpy()) >= SURROUND_DEGREES else "capture")
     ending = ".mp4" if can_mp4() else ".gif"
@@ -73,8 +68,8 @@ def film(run: Path, settings: VideoConfig) -> Path:
     if lit:
         seen = f"light={math.log2(light.gain):g} contrast={light.contrast:g} saturation={light.saturation:g}"
         print(f"lit as {path} was saved: {seen}; light=auto finds it anew")
-    width = scene.test.width
-    scale = max(min(FILM_WIDTH / width, MAX_SCALE), 1.0) if isinstance(module, Splat) else 1.0
+    _, width = scene.test.size(scene.test.largest)
+    scale = max(min(FILM_WIDTH / width, module.max_scale), 1.0)
     if scale > 1:
         print(f"film: {round(scale * width)} pixels wide, {scale:.2g} times the training's pictures")
     cameras = film_cameras(scene, keys or path, settings.frames, scale)
@@ -104,22 +99,22 @@ def check_new(files: Iterable[Path]) -> None:
 
 
 def film_cameras(scene: Scene, path: str | KeyFrames, frames: int, scale: float = 1.0) -> list[Views]:
-    """The cameras of a path, a view each, of ``scale`` times the first test view's size: with its lens, or as a pinhole
-    of the key frames' field of view.
+    """The cameras of a path, a view each, of ``scale`` times the largest test view's size: with its lens, or as a
+    pinhole of the key frames' field of view.
     """
-    test = scene.test
-    lens, distortion = test.intrinsics[:1], None if test.distortion is None else test.distortion[:1]
+    test, own = scene.test, scene.test.largest
+    lens = test.intrinsics[own : own + 1]
+    distortion = None if test.distortion is None else test.distortion[own : own + 1]
+    high, wide = test.size(own)
     if isinstance(path, KeyFrames):
         c2w, fov = path.path(frames)
-        focal, middle = test.height / (2 * (fov / 2).tan()), torch.tensor([test.width / 2, test.height / 2])
+        focal, middle = high / (2 * (fov / 2).tan()), torch.tensor([wide / 2, high / 2])
         lens, distortion = torch.cat([focal[:, None].expand(-1, 2), middle.expand(len(fov), 2)], dim=1), None
     elif path == "test":
         c2w = test.c2w
     else:
         paths = {"orbit": orbit, "capture": capture}
         c2w = paths[path](scene.train, frames) if path in paths else spiral(scene.train, scene.near, scene.far, frames)
-    doubled = zip((test.width, test.height), (2 * lens[0, 2:]).tolist(), strict=True)
-    wide, high = (round(twice) if twice < MIN_PRINCIPAL * side else side for side, twice in doubled)
     lenses = lens.expand(len(c2w), 4).split(1)
     blank = test.images.new_zeros(1, round(scale * high), round(scale * wide), test.images.shape[-1])
     return [

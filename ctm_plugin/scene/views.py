@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -41,6 +42,8 @@ class Views:
             is trained on or fitted to. ``None``: there are none.
         exposures: ``[N]``, the light that each training picture took by its EXIF, up to one factor; NaN where it does
             not tell. ``None``: none tells.
+        sizes: ``[N, 2]`` height and width of pictures that differ, each in the upper left corner of its image;
+            ``None``: all fill theirs.
     """
 
     images: UInt8[Tensor, "n h w c"] | Float32[Tensor, "n h w c"]
@@ -53,6 +56,7 @@ class Views:
     pictured: Bool[Tensor, " n"] | None = field(default=None, metadata=ADDED)
     lit: UInt8[Tensor, "n h w 3"] | None = field(default=None, metadata=ADDED)
     exposures: Float32[Tensor, " n"] | None = field(default=None, metadata=ADDED)
+    sizes: Int64[Tensor, "n 2"] | None = field(default=None, metadata=DERIVED)
 
     def __len__(self) -> int:
         return len(self.images)
@@ -73,6 +77,20 @@ class Views:
             return sides.expand(len(self), 2)
         last = [(self.mask.any(axis).cpu() * torch.arange(1, side + 1)).amax(1) for axis, side in enumerate(sides, 1)]
         return torch.stack(last, 1).clamp_min(1)
+
+    def size(self, index: int) -> tuple[int, int]:
+        """Height and width of a view's own picture."""
+        return (self.height, self.width) if self.sizes is None else tuple(self.sizes[index].tolist())
+
+    @property
+    def largest(self) -> int:
+        """Number of the largest picture, the first of several."""
+        return max(range(len(self)), key=lambda index: math.prod(self.size(index)))
+
+    def own(self, index: int, image: Tensor) -> Tensor:
+        """The part of a view's image ``[H, W, ...]`` that its picture fills."""
+        height, width = self.size(index)
+        return image[:height, :width]
 
     @property
     def has_alpha(self) -> bool:

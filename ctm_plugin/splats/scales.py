@@ -78,4 +78,6 @@ def averaged(views: Views, side: int) -> Views:
     """
     high, wide = views.height // side, views.width // side
     images = [shrink(unit(image[: high * side, : wide * side]), high, wide) for image in views.images]
-    return replace(views, images=torch.stack(images), intrinsics=views.intrinsics / side, mask=_masks(views, side))
+    return replace(
+        views, images=torch.stack(images), intrinsics=views.intrinsics / side, mask=_masks(views, side), sizes=None
+    )

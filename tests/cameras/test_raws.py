@@ -9,8 +9,9 @@ from PIL import Image
 
 from ctm_plugin.cameras.photographs import list_photographs
 from ctm_plugin.cameras.raws import develop_raws
-from ctm_plugin.color.srgb import linear_to_srgb
+from ctm_plugin.color.srgb import linear_to_srgb, srgb_to_linear
 from ctm_plugin.data.readers.images import read_image, read_picture
+from ctm_plugin.data.readers.picture import Lens
 from ctm_plugin.errors import CTMError, DataError
 
 COLOR = np.array([0.06, 0.12, 0.05])
@@ -37,6 +38,25 @@ def test_all_have_the_light_of_the_longest(night, capsys):
         assert (read_image(folder / f"IMG_{number}.tif") - expected).abs().max() < 3e-3
         header = read_picture(folder / f"IMG_{number}.tif").header
         assert (header.deep, header.orientation, header.height, header.width) == (True, 6, 48, 32)
+
+
+def test_hot_pixels_are_repaired(tmp_path, capsys):
+    for number in range(6):
+        sensor = np.random.default_rng(number).normal(0.02, 0.004, (48, 64, 3))
+        sensor[20, 30] = 0.5
+        write_dng(tmp_path / f"{number}.dng", sensor)
+    develop_raws(tmp_path)
+    said = "6 raw pictures developed with one white balance, 1 hot pixels repaired: "
+    assert capsys.readouterr().out.startswith(said)
+    for path in (tmp_path / "developed").iterdir():
+        assert srgb_to_linear(read_image(path)).max() < 0.1
+
+
+def test_the_lens_is_told(tmp_path):
+    for name in "abc":
+        write_dng(tmp_path / f"{name}.dng", flat(COLOR))
+    develop_raws(tmp_path)
+    assert read_picture(tmp_path / "developed" / "a.tif").header.lens == Lens("Test", "Test")
 
 
 def test_they_are_used_again_and_go_before_the_cameras_own_jpeg(night, capsys):

@@ -13,6 +13,7 @@ from PIL.TiffImagePlugin import IFDRational
 from png import chunk, png, png_16
 
 from ctm_plugin.color.srgb import linear_to_srgb
+from ctm_plugin.data.readers.deep import write_tiff
 from ctm_plugin.data.readers.images import heif_formats, opened, read_depth, read_image, read_picture, to_8_bits
 from ctm_plugin.data.readers.picture import MAX_PIXELS, Header, Lens, exposure_of
 from ctm_plugin.errors import CTMError, DataError
@@ -179,6 +180,30 @@ def png_of(folder, levels, orientation):
     exif[ORIENTATION] = orientation
     Image.fromarray(levels).save(folder / "a.png", exif=exif)
     return folder / "a.png"
+
+
+def test_a_tiff_tells_its_lens(tmp_path):
+    """As another program writes it, and as developed raw pictures have it."""
+    black = np.zeros((4, 6, 3), np.uint8)
+    Image.fromarray(black).save(tmp_path / "a.tif", tiffinfo={271: "Maker", 272: "Model"})
+    assert read_picture(tmp_path / "a.tif").header.lens == Lens("Maker", "Model")
+    expected = Lens("Maker", "Model", 6.5, 26.0)
+    write_tiff(tmp_path / "b.tif", black.astype(np.uint16), 6, expected)
+    header = read_picture(tmp_path / "b.tif").header
+    assert (header.lens, header.height, header.orientation, header.deep) == (expected, 6, 6, True)
+    assert tifffile.TiffFile(tmp_path / "b.tif").pages[0].tags["ExifTag"].value["FocalLengthIn35mmFilm"] == 26
+    Image.fromarray(black).save(tmp_path / "c.tif")
+    assert read_picture(tmp_path / "c.tif").header.lens == Lens()
+
+
+@pytest.mark.parametrize(("mode", "alpha"), [("RGB;16", False), ("RGBA;16", True)])
+def test_a_heic_of_10_bits_keeps_them(tmp_path, mode, alpha):
+    levels = np.arange(8 * 8 * (3 + alpha), dtype=np.uint16).reshape(8, 8, -1) % 1024
+    lossless = {"quality": -1, "chroma": 444, "matrix_coefficients": 0}
+    pillow_heif.from_bytes(mode, (8, 8), (levels << 6).tobytes()).save(tmp_path / "a.heic", **lossless)
+    found = read_picture(tmp_path / "a.heic")
+    assert (found.header.deep, found.header.alpha) == (True, alpha)
+    np.testing.assert_allclose(found.image(), levels.astype(float) * 64 / 65535, atol=1e-6)
 
 
 def test_a_heic_of_other_colours_says_so(tmp_path):

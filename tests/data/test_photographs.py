@@ -171,12 +171,14 @@ def test_pictures_of_two_sizes(yard, tmp_path):
             height, width = (20, 12) if number in upright else (HEIGHT, WIDTH)
             stored = iio.imread(yard / "images" / NAMES[number])
             np.testing.assert_array_equal(views.images[index, :height, :width], stored)
+            assert views.own(index, views.images[index]).shape[:2] == views.size(index) == (height, width)
             assert views.mask[index, :height, :width].all()
             assert views.mask[index].sum() == height * width
             assert not views.images[index][~views.mask[index]].any()
     with pytest.warns(UserWarning, match="sizes"):
         half = load(yard, width=12)  # the widest one's
     index = half.train.names.index("f_01")
+    assert half.train.size(index) == (10, 6)
     assert half.train.mask[index].nonzero().amax(0).tolist() == [9, 5]
     torch.testing.assert_close(half.train.intrinsics, found.train.intrinsics / 2)
 
@@ -194,6 +196,18 @@ def test_exposures_of_training_pictures(yard):
     expected = torch.tensor([(index + 1) / 8 if index < len(NAMES) - 1 else torch.nan for index in kept])
     torch.testing.assert_close(scene.train.exposures, expected, equal_nan=True)
     assert scene.test.exposures is None
+
+
+def test_exposures_of_two_cameras_are_compared_with_their_own(yard):
+    for index, name in enumerate(NAMES):
+        exif = Image.Exif()
+        exif[ExifTags.Base.Orientation] = 1
+        exif[ExifTags.Base.Model] = ("one", "other")[index % 2]
+        exif.get_ifd(ExifTags.IFD.Exif)[ExifTags.Base.ExposureTime] = (0.5, 2.0)[index % 2] * (1 + (index == 3))
+        Image.fromarray(np.zeros((HEIGHT, WIDTH, 3), np.uint8)).save(yard / "images" / name, exif=exif)
+    scene = load(yard)
+    expected = torch.tensor([2.0 if name == "f_03" else 1.0 for name in scene.train.names])
+    torch.testing.assert_close(scene.train.exposures, expected)
 
 
 def masks(root: Path, names: list[str], size: tuple[int, int] = YARD_SIZE) -> np.ndarray:

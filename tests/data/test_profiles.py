@@ -68,6 +68,15 @@ def test_profiles_become_srgb(tmp_path, suffix, colours, channels):
     assert read_picture(path).header.colours is None
 
 
+def test_colours_of_a_heic_go_before_its_bits(tmp_path):
+    pillow_heif = pytest.importorskip("pillow_heif")
+    for name, colours, deep in (("wide", WIDE, False), ("usual", None, True)):
+        picture = pillow_heif.from_bytes("RGB;16", LEVELS.shape[1::-1], (LEVELS.astype(np.uint16) << 8).tobytes())
+        picture.save(tmp_path / f"{name}.heic", **({"icc_profile": profile(*colours)} if colours else {}))
+        header = read_picture(tmp_path / f"{name}.heic").header
+        assert (header.deep, header.colours) == (deep, None)
+
+
 def test_grey_profiles(tmp_path):
     levels = LEVELS[..., 0]
     Image.fromarray(levels).save(tmp_path / "a.png", icc_profile=profile(None, 1.0))

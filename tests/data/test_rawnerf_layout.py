@@ -13,7 +13,8 @@ from layouts import rawnerf_layout
 from ctm_plugin.color.srgb import linear_to_srgb
 from ctm_plugin.data.rawnerf import RawNeRFConfig, relative_brightness
 from ctm_plugin.data.readers.images import read_picture
-from ctm_plugin.data.readers.raw import open_raw, raw_exposure
+from ctm_plugin.data.readers.picture import exposure_of
+from ctm_plugin.data.readers.raw import open_raw, raw_exif
 from ctm_plugin.data.settings import RAWNERF_SCENES
 from ctm_plugin.errors import ConfigError, CTMError, DataError
 
@@ -142,7 +143,7 @@ def test_exposures_by_the_pictures_own_exif(night, suffix):
 
 def test_a_raw_picture_that_tells_nothing(tmp_path):
     (tmp_path / "a.cr3").write_bytes(b"\0\0\0\x18ftypcrx " + bytes(200))
-    assert raw_exposure(tmp_path / "a.cr3") is None
+    assert exposure_of(raw_exif(tmp_path / "a.cr3")) is None
 
 
 def test_rawpy_missing(night, monkeypatch):

@@ -68,6 +68,7 @@ def scene(ball) -> Scene:
     mask = torch.rand(train.images.shape[:3]) > 0.3
     mask[:, :, 9:] = False
     more = {"distortion": torch.rand(len(train), 5), "mask": mask, "exposures": torch.rand(len(train)) + 0.1}
+    more["sizes"] = torch.arange(2 * len(train)).view(-1, 2) % 8 + 1
     train = replace(train, images=train.images[..., :3] / 2550, **more)
     return replace(scene, train=train, world=Similarity(0.3, np.eye(3)[[1, 2, 0]], np.array([0.1, 2, -3]), 0.0, 0.0))
 
@@ -84,7 +85,7 @@ def test_all_but_the_pictures_comes_back(scene, tmp_path):
         before, after = getattr(scene, split), getattr(found, split)
         assert after.names == before.names
         assert (after.images.shape, after.images.dtype) == (before.images.shape, before.images.dtype)
-        for key in ("c2w", "intrinsics", "distortion", "mask", "exposures", "extents"):
+        for key in ("c2w", "intrinsics", "distortion", "mask", "exposures", "sizes", "extents"):
             one, other = getattr(before, key), getattr(after, key)
             assert other is None if one is None else torch.equal(one, other)
         assert not after.pictured.any()
@@ -118,6 +119,8 @@ def test_older_runs_have_none(tmp_path):
         ("test.size.2", 5),
         ("train.mask", [1, 2]),
         ("train.mask", [-1]),
+        ("train.sizes.0", [0, 1]),
+        ("train.sizes.0", [1, 100]),
         ("near", None),
         ("far", 0),
         ("light", [-1, 1, 1]),

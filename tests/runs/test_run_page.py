@@ -3,14 +3,19 @@
 import base64
 import re
 import shutil
+from dataclasses import replace
+from io import BytesIO
 from pathlib import Path
 
 import imageio.v3 as iio
 import numpy as np
 import pytest
+import torch
 from browser import opened, seen, until
+from PIL import Image
 
 from ctm_plugin.cli import main
+from ctm_plugin.metrics.evaluate import Scoring
 from ctm_plugin.runs import page as pages
 from ctm_plugin.runs.load import load_posed
 from ctm_plugin.runs.page import write_page
@@ -135,6 +140,24 @@ def test_facts(own):
     assert "10% of the fine detail" in pages.facts(posed, posed.light, {"detail": 0.1})[2]
     assert "something went wrong" in pages.facts(posed, posed.light, {"detail": 0.1})[2]
     assert "wrong" not in pages.facts(posed, posed.light, {"detail": 0.6})[2]
+
+
+def test_pictures_of_several_sizes_are_shown_without_what_fills_the_canvas(own, monkeypatch):
+    posed = load_posed(own)
+    scene = posed.module.scene
+    sizes = torch.tensor([[64, 40], [30, 64], [30, 64]]).repeat(len(scene.test), 1)[: len(scene.test)]
+    monkeypatch.setattr(posed.module, "scene", replace(scene, test=replace(scene.test, sizes=sizes)))
+    shots, size = pages.shots_of(posed.module, posed.light)
+    assert size == (40, 64)
+    assert {each.size for each in shots} == {(40, 64), (64, 30)}
+    for each in shots:
+        for address in (each.lit, each.taken, each.photo):
+            assert Image.open(BytesIO(base64.b64decode(address.partition(",")[2]))).size == each.size
+    write_page(own / "index.html", own, posed, posed.light)
+    assert 'class="stage compare" style="--ratio: 64 / 30"' in text_of(own)
+    posed.module.scores(own / "again", Scoring())
+    names = scene.test.names[:2]
+    assert [Image.open(own / f"again/photo/{name}.png").size for name in names] == [(40, 64), (64, 30)]
 
 
 @pytest.mark.slow

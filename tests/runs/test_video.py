@@ -73,13 +73,15 @@ def test_a_saved_path_is_lit_as_it_was_seen(run, tmp_path, capsys):
     assert films[3].mean() > films[0].mean() + 5
 
 
-def test_a_film_has_the_middle_of_a_picture_that_is_smaller_than_the_others(run):
+def test_a_film_has_lens_and_size_of_the_largest_picture(run):
     """Pictures of several sizes lie in the upper left corner of one canvas."""
     scene = load_posed(run).module.scene
-    upright = scene.test.intrinsics.clone()
-    upright[:, 2] *= 0.5
-    cameras = film_cameras(replace(scene, test=replace(scene.test, intrinsics=upright)), "test", 1)
-    assert (cameras[0].width, cameras[0].height) == (scene.test.width // 2, scene.test.height)
+    test = scene.test
+    sizes = torch.tensor([[8, 8], *[[test.height, test.width // 2]] * (len(test) - 1)])
+    lenses = test.intrinsics * torch.arange(1, len(test) + 1)[:, None]
+    cameras = film_cameras(replace(scene, test=replace(test, sizes=sizes, intrinsics=lenses)), "test", 1)
+    assert (cameras[0].width, cameras[0].height) == (test.width // 2, test.height)
+    torch.testing.assert_close(cameras[0].intrinsics, lenses[1:2])
     assert (film_cameras(scene, "test", 1)[0].width) == scene.test.width
     (wider, *_) = film_cameras(scene, "test", 1, 1.5)
     assert (wider.width, wider.height) == (round(1.5 * scene.test.width), round(1.5 * scene.test.height))

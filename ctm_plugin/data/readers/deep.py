@@ -9,10 +9,21 @@ from typing import Any
 
 import numpy as np
 import torch
+from jaxtyping import UInt16
+from PIL.ExifTags import Base
 from torch import Tensor
 
 from ctm_plugin.data.readers.folders import require_file, told
-from ctm_plugin.data.readers.picture import MAX_PIXELS, Opened, check_size, from_light, unpremultiplied, upright_header
+from ctm_plugin.data.readers.picture import (
+    MAX_PIXELS,
+    Lens,
+    Opened,
+    check_size,
+    from_light,
+    lens_of,
+    unpremultiplied,
+    upright_header,
+)
 from ctm_plugin.data.readers.profiles import as_srgb, foreign
 from ctm_plugin.errors import DataError
 
@@ -21,6 +32,11 @@ EXPECTED = (
     f"{MAX_PIXELS} pixels: copy it here again, or leave it out"
 )
 GREY, COLOUR = (("Y",), ("Y", "A")), (("R", "G", "B"), ("R", "G", "B", "A"))
+LENS_NAMES = {
+    Base.Make: "Make", Base.Model: "Model", Base.FocalLength: "Exif:FocalLength",
+    Base.FocalLengthIn35mmFilm: "Exif:FocalLengthIn35mmFilm", Base.DigitalZoomRatio: "Exif:DigitalZoomRatio",
+}  # fmt: skip
+"""OpenImageIO's names of EXIF's tags, in the order of :class:`Lens`."""
 WHOLE, LIGHT = ("uint8", "uint16"), ("half", "float", "double")
 """OpenImageIO's names of the number types of stored levels, and of those of linear light."""
 
@@ -55,6 +71,20 @@ def colored(pixels: np.ndarray) -> np.ndarray:
     return pixels if pixels.shape[-1] > 2 else pixels[..., [0, 0, 0, *range(1, pixels.shape[-1])]]
 
 
+def write_tiff(path: Path, codes: UInt16[np.ndarray, "h w 3"], orientation: int, lens: Lens) -> None:
+    """Write sRGB of 16 bits, with EXIF's orientation and lens."""
+    import OpenImageIO as oiio
+
+    spec = oiio.ImageSpec(codes.shape[1], codes.shape[0], 3, "uint16")
+    lens = lens._replace(film=lens.film and round(lens.film))  # EXIF has whole millimetres
+    for name, value in (("Orientation", orientation), *zip(LENS_NAMES.values(), lens, strict=True)):
+        if value is not None:
+            spec.attribute(name, value)
+    file = oiio.ImageOutput.create("tiff")
+    if not (file.open(str(path), spec) and file.write_image(codes) and file.close()):
+        raise OSError(file.geterror())
+
+
 @contextmanager
 def open_deep(path: Path) -> Iterator[Opened]:
     """Open a TIFF or an EXR. 16 bits, and 8 without an ICC profile, are taken for sRGB, floats for linear light."""
@@ -83,4 +113,5 @@ def open_deep(path: Path) -> Iterator[Opened]:
                 stored = unpremultiplied(stored)
             return from_light(stored, path) if light else torch.from_numpy(stored).clamp_(max=1.0)
 
-        yield Opened(header._replace(colours=foreign(profile, grey, deep, light)), pixels)
+        tags = {tag: value for tag, name in LENS_NAMES.items() if (value := spec.getattribute(name)) is not None}
+        yield Opened(header._replace(colours=foreign(profile, grey, deep, light), lens=lens_of(tags, tags)), pixels)

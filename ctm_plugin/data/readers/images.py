@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float32, UInt8
+from jaxtyping import Float32, UInt8, UInt16
 from PIL import ExifTags, Image
 from torch import Tensor
 
@@ -79,6 +79,14 @@ def heif_formats() -> tuple[str, ...]:
     return ("HEIF",)
 
 
+def deep_heic(path: Path) -> UInt16[np.ndarray, "h w c"]:
+    """The upright pixels of a HEIC of more than 8 bits, in the upper ones of 16."""
+    from pillow_heif import open_heif
+
+    pixels = np.asarray(open_heif(path, convert_hdr_to_8bit=False))
+    return colored(pixels.reshape(*pixels.shape[:2], -1))
+
+
 def is_adobe_rgb(exif: Image.Exif) -> bool:
     """Whether EXIF says that a picture's colours are Adobe RGB."""
     with suppress(KeyError):  # Pillow before 13, where there is no such part
@@ -88,7 +96,7 @@ def is_adobe_rgb(exif: Image.Exif) -> bool:
 
 @contextmanager
 def open_usual(path: Path) -> Iterator[Opened]:
-    """Open a PNG, JPEG, WebP, AVIF or HEIC. Grey becomes colour, palettes are looked up, 16 bits are kept.
+    """Open a PNG, JPEG, WebP, AVIF or HEIC. Grey becomes colour, palettes are looked up, 10 to 16 bits are kept.
 
     ICC profiles (of 8 bits) and PNG's gAMA are converted to sRGB; the header names other colours.
     """
@@ -96,9 +104,10 @@ def open_usual(path: Path) -> Iterator[Opened]:
         # A PNG's own getexif would decode the whole picture.
         exif = Image.Image.getexif(image)
         orientation = exif.get(ExifTags.Base.Orientation, UPRIGHT_ORIENTATION)
-        # Pillow unpacks only the upper byte of twice 8 bits.
-        deep, grey = image.format == "PNG" and image.tile[0][3].endswith("16B"), image.mode in GREY_MODES
-        profile = image.info.get("icc_profile")
+        grey, profile = image.mode in GREY_MODES, image.info.get("icc_profile")
+        # Of more than 8 bits Pillow unpacks only the upper ones. Those of a profile that is converted go without.
+        of_heic = image.info.get("bit_depth", 8) > 8 and foreign(profile, grey, True) is None
+        deep = of_heic or (image.format == "PNG" and image.tile[0][3].endswith("16B"))
         colours = foreign(profile, grey, deep) or png_colours(image) or heif_colours(image)
         if not profile and is_adobe_rgb(exif):
             colours = "Adobe RGB by its EXIF"
@@ -108,7 +117,9 @@ def open_usual(path: Path) -> Iterator[Opened]:
 
         def pixels() -> Tensor:
             gamma = None if colours else png_gamma(image)
-            if deep:
+            if of_heic:
+                stored = deep_heic(path)
+            elif deep:
                 with opened_file(path) as file:
                     stored = colored(numbers(file))
             else:

@@ -7,23 +7,27 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import numpy as np
 import torch
+from jaxtyping import Bool, UInt16
 from PIL import Image
 from PIL.ExifTags import IFD
 from torch import Tensor
 
 from ctm_plugin.color.srgb import linear_to_srgb
 from ctm_plugin.data.readers.folders import read_bytes, require_file, told
-from ctm_plugin.data.readers.picture import MAX_PIXELS, Header, Opened, check_size, exposure_of
+from ctm_plugin.data.readers.hot_pixels import repair
+from ctm_plugin.data.readers.picture import MAX_PIXELS, Header, Lens, Opened, check_size, exposure_of, lens_of
 from ctm_plugin.errors import CTMError
 
 
 @contextmanager
 def open_raw(
-    path: Path, brightness: float = 1.0, balance: Sequence[float] | None = None, half: bool = False
-) -> Iterator[Opened]:
+    path: Path, brightness: float = 1.0, balance: Sequence[float] | None = None, half: bool = False,
+    hot: Bool[np.ndarray, "h w"] | None = None,
+) -> Iterator[Opened]:  # fmt: skip
     """Open a raw picture, developed alike for all pictures of a scene, so that equal light gives equal colours.
 
     Black level subtracted, white level to 1, the camera's own white balance, sRGB's primaries; no automatic brightness,
@@ -35,6 +39,7 @@ def open_raw(
         brightness: factor on the light.
         balance: factors on red, green, blue and the second green in place of the camera's own.
         half: a pixel for each four of the sensor's, so that no colour is made up from those next to it.
+        hot: pixels of the sensor that are repaired, see :func:`~ctm_plugin.data.readers.hot_pixels.hot_pixels`.
     """
     rawpy = require_rawpy()
     expected = f"a raw picture that LibRaw can develop, of at most {MAX_PIXELS} pixels"
@@ -44,6 +49,8 @@ def open_raw(
         check_size(path, sizes.raw_width, sizes.raw_height, expected)
 
         def pixels() -> Tensor:
+            if hot is not None:
+                repair(raw.raw_image_visible, hot)
             linear = raw.postprocess(
                 use_camera_wb=balance is None,
                 user_wb=None if balance is None else [*balance],
@@ -76,16 +83,18 @@ class RawHeader(NamedTuple):
     """Metadata of a raw picture.
 
     Attributes:
-        side: the longer side in pixels.
+        sensor: height and width in pixels.
         orientation: the turn that makes it upright, in EXIF's numbers.
         balance: the camera's factors on red, green, blue and the second green.
-        exposure: see :func:`raw_exposure`.
+        exposure: see :func:`exposure_of`.
+        lens: by its EXIF.
     """
 
-    side: int
+    sensor: tuple[int, int]
     orientation: int
     balance: tuple[float, ...]
     exposure: float | None
+    lens: Lens
 
 
 def read_raw(path: Path) -> RawHeader:
@@ -95,18 +104,25 @@ def read_raw(path: Path) -> RawHeader:
     require_file(path, expected)
     with told(path, "a file that cannot be developed", expected), rawpy.imread(str(path)) as raw:
         sizes, balance = raw.sizes, tuple(raw.camera_whitebalance)
-    side, turned = max(sizes.height, sizes.width), {3: 3, 5: 8, 6: 6}.get(sizes.flip, 1)
-    return RawHeader(side, turned, balance, raw_exposure(path))
+    turned, tags = {3: 3, 5: 8, 6: 6}.get(sizes.flip, 1), raw_exif(path)
+    return RawHeader((sizes.height, sizes.width), turned, balance, exposure_of(tags), lens_of(tags, tags))
 
 
-def raw_exposure(path: Path) -> float | None:
-    """Exposure of a raw picture by its EXIF, see :func:`exposure_of`; a DNG may have it in its first directory.
+def read_mosaic(path: Path) -> UInt16[np.ndarray, "h w"] | None:
+    """Read a sensor's values of a raw picture; ``None``: it has no Bayer pattern."""
+    with told(path, "a file that cannot be developed", "a raw picture"), require_rawpy().imread(str(path)) as raw:
+        bayer = raw.raw_pattern is not None and raw.raw_pattern.shape == (2, 2)
+        return raw.raw_image_visible.copy() if bayer else None
 
-    ``None``: EXIF does not give it, or the file is not based on TIFF, as most raw formats are.
+
+def raw_exif(path: Path) -> dict[int, Any]:
+    """Read a raw picture's EXIF; a DNG may have it in its first directory.
+
+    Empty: the file is not based on TIFF, as most raw formats are.
     """
     exif = Image.Exif()
     try:
         exif.load(read_bytes(path, "a raw picture"))
-        return exposure_of({**exif, **exif.get_ifd(IFD.Exif)})
+        return {**exif, **exif.get_ifd(IFD.Exif)}
     except (SyntaxError, struct.error, ValueError, KeyError, TypeError):  # what Pillow raises on other files
-        return None
+        return {}
