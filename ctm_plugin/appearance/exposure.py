@@ -69,7 +69,7 @@ class Exposure(nn.Module):
         return light / self.log_gains().exp().index_select(0, place.view)[:, None]
 
     def regularisers(self) -> dict[str, Tensor]:
-        """Weighted loss terms by name, ``[]`` each, that restrain the appearance's parameters."""
+        """Weighted loss terms by name, ``[]`` each, that regularise the appearance's parameters."""
         return {}
 
     def optimizer(self, steps: int) -> tuple[Optimizer, Schedule] | None:

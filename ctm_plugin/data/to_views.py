@@ -89,7 +89,7 @@ def upright(photographs: Sequence[Photograph], source: Path) -> list[Photograph]
 
 
 def headers_of(photographs: Sequence[Photograph]) -> list[Header]:
-    """Each photograph's header; a missing picture gets the header of the one whose size is nearest to its camera's."""
+    """Each photograph's header; a missing picture gets the size of the one with the shape nearest to its camera's."""
     known = [each.picture.header for each in photographs if each.picture]
 
     def like(camera: Intrinsics) -> Header:

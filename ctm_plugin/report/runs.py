@@ -16,7 +16,7 @@ from ctm_plugin.settings.setting import is_number
 MAX_ERROR = 10_000
 """Most characters of a failed run's error that are shown."""
 MAX_SCORE = 1e9
-"""Least number that counts as no score: means of larger ones would overflow."""
+"""Bound on scores: larger numbers count as missing."""
 LOSS_TERMS = ("enc", "dec", "img", "rand", "latent")
 """Names of the terms of CTM's loss."""
 CHOICE_KEYS = {"backbone": "name", "ctm": "name", "color_space": "name", "loss": "kind", "appearance": "name"}
@@ -27,7 +27,7 @@ LOCATION_KEYS = {
     "ctm.k",
     *(f"dataset.{key}" for key in ("root", "image", "seed", "scene")),
 }
-"""Keys that do not count as settings besides a run's own: places of the data, and keys named in its setting."""
+"""Keys left out of a run's ``rest``: places of the data, and keys that its ``setting`` has already."""
 Setting = dict[str, str | None]
 """A run's setting: keys of a command line and their values; ``None``: the preset's value."""
 

@@ -225,7 +225,7 @@ def spots_of(gaussians: Gaussians) -> Spots:
 
 
 def start_of(module: Splat, cameras: Sequence[Camera]) -> Start:
-    """Start of a walk: the training camera nearest to the middle of all, in the files' world, looking at its middle.
+    """Start of a walk: the training camera nearest to the mean of all, in the files' world, facing as it did.
 
     The up direction is that of the mean photograph.
     """

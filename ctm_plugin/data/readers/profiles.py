@@ -27,7 +27,7 @@ class Profile(NamedTuple):
     Attributes:
         mode: Pillow's mode of the pictures that it describes, RGB or L.
         to_srgb: LittleCMS's transform of such pictures.
-        off: largest difference from sRGB in levels of 255; for linear profiles after sRGB's curve.
+        off, off_as_light: largest difference in levels of 255 from sRGB, and from linear light turned into sRGB.
     """
 
     mode: str
