@@ -34,7 +34,7 @@ FFMPEG_BT709 = ["-vf", f"scale=out_color_matrix=bt709:out_range=tv,setparams={BT
 """ffmpeg's arguments: BT.709's colours, tagged as such, and the index at the file's beginning."""
 
 FILM_WIDTH, MAX_SCALE = 1280, 2.0
-"""Width in pixels that films of splats reach, at most so many times the training's: there they are 0.05 dB closer to
+"""Width in pixels that films of splats reach, at most so many times the training's: there they are 0.04 dB closer to
 larger photographs than enlarged pictures are (RealX3D's MilkCookie, trained 300 pixels wide)."""
 MIN_PRINCIPAL = 0.9
 """Principal point's coordinate, as a share of the picture's middle, below which the picture lies on a larger canvas."""
