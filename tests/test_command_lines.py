@@ -10,11 +10,13 @@ import re
 import runpy
 import shlex
 import subprocess
+import sys
 import tomllib
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import wraps
 from pathlib import Path
 from typing import NamedTuple
+from unittest.mock import patch
 
 import pytest
 from ctm_scenes.settings import VERB
@@ -278,8 +280,10 @@ def pip(words: Sequence[str]) -> None:
 def python(words: Sequence[str]) -> None:
     """A module, or a script of the checkout, which is there, can be imported and knows its flags."""
     if words[0] != "-m":
-        runpy.run_path(str(ROOT / words[0]), run_name="looked_at")
-        source = (ROOT / words[0]).read_text(encoding="utf-8")
+        script = ROOT / words[0]
+        with patch.object(sys, "path", [str(script.parent), *sys.path]):  # scripts import their neighbours
+            runpy.run_path(str(script), run_name="looked_at")
+        source = script.read_text(encoding="utf-8")
         assert [word for word in words[1:] if word.startswith("--") and f'"{word}"' not in source] == []
     elif words[1] == "pytest":
         paths = [word for flag, word in itertools.pairwise(words[1:]) if not word.startswith("-") and flag != "-k"]

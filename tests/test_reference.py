@@ -72,7 +72,6 @@ def test_the_keys_beside_the_groups(reference):
     beside = ("backbone.steps", "backbone.relative", "backbone.shifts_until", "ctm.photometric", "ctm.fills")
     assert all(f"| `{name}` |" in page for name in beside)
     assert "`ctm.relative`" not in page
-    assert "### search_weights" in page
 
 
 def test_the_page_of_verbs(reference):

@@ -63,7 +63,7 @@ class Splat(PictureBackbone):
     betas = (0.9, 0.999)
     loops_only = True
     max_scale = 2.0
-    """Twice as wide, pictures are .05 dB closer to larger photographs than enlarged ones (RealX3D's MilkCookie)."""
+    """Twice as wide, pictures are .04 dB closer to larger photographs than enlarged ones (RealX3D's MilkCookie)."""
 
     def __init__(
         self, config: SplatConfig, scene: Scene, transform: ColorTransform | None = None,
