@@ -304,6 +304,9 @@ class SplatConfig(Settings, section="backbone"):
     lr_means: float = setting(
         1.6e-4, "learning rate of the Gaussians' places, divided by the extent of the cameras", above=0
     )
+    lr_scales: float = setting(5e-3, "learning rate of the logarithms of the Gaussians' scales", above=0)
+    lr_quats: float = setting(1e-3, "learning rate of the Gaussians' quaternions", above=0)
+    lr_sh0: float = setting(2.5e-3, "learning rate of the Gaussians' colours", above=0)
     lr_opacities: float = setting(5e-2, "learning rate of opacities before the sigmoid", above=0)
     lr_rest: float = setting(
         0.05, "learning rate of the colours' dependence on the direction, as a share of theirs", above=0

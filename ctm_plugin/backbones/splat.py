@@ -35,8 +35,6 @@ NEAR_FRACTION = 0.2
 """Near plane of a picture, as a share of the scene's near bound."""
 RESET_OPACITY = 0.01
 """Largest opacity after a reset (3DGS)."""
-LR_SCALES, LR_QUATS, LR_SH0 = 5e-3, 1e-3, 2.5e-3
-"""Learning rates of 3DGS: of the logarithms of scales, of quaternions, of colours."""
 LR_MEANS_FINAL = 0.01
 """Factor that the learning rate of means has fallen to at the last step."""
 SPLAT_COST = 0.7
@@ -127,8 +125,8 @@ class Splat(PictureBackbone):
 
     def field_optimizers(self) -> dict[str, Optimizer]:
         config, tables = self.config, self.tables
-        rates = {"scales": LR_SCALES, "quats": LR_QUATS, "opacities": config.lr_opacities}
-        rates |= {"sh0": LR_SH0, "shN": LR_SH0 * config.lr_rest}
+        rates = {"scales": config.lr_scales, "quats": config.lr_quats, "opacities": config.lr_opacities}
+        rates |= {"sh0": config.lr_sh0, "shN": config.lr_sh0 * config.lr_rest}
         groups = [{"params": [tables[name]], "lr": rate, "name": name} for name, rate in rates.items()]
         means = [{"params": [tables["means"]], "lr": config.lr_means * self.extent, "name": "means"}]
         return {

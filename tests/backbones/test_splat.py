@@ -75,6 +75,13 @@ def test_pictures_with_more_pixels_have_no_gaps(scene, monkeypatch):
     assert differs() > 0.5
 
 
+def test_rates_are_those_of_the_configuration(scene):
+    module = make(scene, lr_means=1e-3, lr_scales=2e-3, lr_quats=3e-3, lr_sh0=4e-3, lr_opacities=5e-3, lr_rest=0.5)
+    rates = {each["name"]: each["lr"] for part in module.field_optimizers().values() for each in part.param_groups}
+    own = {"scales": 2e-3, "quats": 3e-3, "sh0": 4e-3, "opacities": 5e-3, "shN": 2e-3}
+    assert rates == pytest.approx(own | {"means": 1e-3 * module.extent})
+
+
 def gradients(module: Splat) -> dict[str, Tensor]:
     return {name: table.grad for name, table in module.tables.items()}
 
