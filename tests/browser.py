@@ -34,7 +34,7 @@ def opened(address: str, foreign: Callable[[str], bool], **settings: Any) -> Ite
         browser.close()
 
 
-def until(true: Callable[[], bool], what: str, seconds: float = 25.0) -> None:
+def until(true: Callable[[], bool], what: str, seconds: float = 90.0) -> None:
     end = time.monotonic() + seconds
     while not true():
         assert time.monotonic() < end, f"not within {seconds:g} s: {what}"
