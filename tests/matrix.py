@@ -69,7 +69,8 @@ def run(name: str, more: list[str]) -> int:
     told = " ".join(f"{key}={value}" for key, value in setting.items())
     print(f"\n=== {name}: {told}", flush=True)
     begun, busy = time.monotonic(), busy_seconds()
-    command = [sys.executable, "-m", "pytest", "-q", "-n", "2", *NUMERICAL]
+    workers = 2 // int(setting["OMP_NUM_THREADS"])  # more threads than cores wait for one another
+    command = [sys.executable, "-m", "pytest", "-q", "-n", str(workers), *NUMERICAL]
     command += TRAINING if "CTM_REORDERED" in setting else [f"--deselect={test}" for test in LEFT_OUT]
     command += more
     code = subprocess.run(command, env=environment | setting).returncode
