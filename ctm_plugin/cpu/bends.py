@@ -10,11 +10,9 @@ from numba import prange
 from torch import Tensor
 
 from ctm_plugin.cpu.compiled import compiled, fused_part
-from ctm_plugin.cpu.splats import E0, E1, E2, E3, E4, E5
+from ctm_plugin.cpu.splats import clipped_exp
 
 ZERO, ONE, TWO = (np.float32(value) for value in (0, 1, 2))
-MIN_EXPONENT, EXP_SCALE = np.float32(-16), np.float32(1 / 32)
-"""Least argument of exp() that is computed, and the scale at which its polynomial is taken."""
 STRIDES = (1, 4)
 """Pixels from one of three compared pixels to the next, as in :mod:`ctm_plugin.splats.render`."""
 MIN_OPACITY, PER_EDGE = np.float32(0.1), np.float32(-1 / 0.03)
@@ -56,18 +54,6 @@ class Bends(torch.autograd.Function):
 
 
 @fused_part
-def _exp(p):
-    """exp() on [-16, 0], and what lies below as if it were -16: of p / 32, squared five times."""
-    q = max(p, MIN_EXPONENT) * EXP_SCALE
-    r = ((((E5 * q + E4) * q + E3) * q + E2) * q + E1) * q + E0
-    r = r * r
-    r = r * r
-    r = r * r
-    r = r * r
-    return r * r
-
-
-@fused_part
 def _folds(before, here, after, first, middle, last, one, other, pull, scale, count):
     """Sum the weighted second differences of inverse depth over a row of centres; ``pull`` gets their slopes.
 
@@ -81,7 +67,7 @@ def _folds(before, here, after, first, middle, last, one, other, pull, scale, co
     per, total = PER_EDGE / np.float32(len(middle)), ZERO
     for i in range(count):
         second = before[i] - TWO * here[i] + after[i]
-        weight = _exp(per * max(one[i], other[i]))
+        weight = clipped_exp(per * max(one[i], other[i]))
         total += abs(second) * weight
         pull[i] = scale * weight * (np.float32(second > ZERO) - np.float32(second < ZERO))
     return total

@@ -108,18 +108,19 @@ def _of_what_is_kept(error: Exception) -> bool:
 def _machine_code(function: Callable, signature: str, fused: bool, parallel: bool) -> Callable:
     """Compile a function, or load its code from the cache; where it cannot be kept, compile anew, with a warning.
 
-    One process at a time: numba's files, written by several at once, may end with one function's code under the key of
-    another.
+    One process at a time compiles a function: numba's files, written by several at once, may end with one signature's
+    code under the key of another.
     """
     options = {"parallel": parallel, "nogil": True, "error_model": "numpy"}
     options |= {"fastmath": FUSED} if fused else {}
+    name = f"{Path(inspect.getfile(function)).stem}.{function.__name__}"  # as numba calls its files
     folder = Path(__file__).parent
     try:
         kernel = numba.njit(cache=True, **options)(function)
         folder = Path(kernel.stats.cache_path)
         folder.mkdir(parents=True, exist_ok=True)
-        with FileLock(folder / "ctm_plugin.lock", timeout=LOCK_S):
-            kept = list(folder.glob(f"*.{function.__name__}-*.nbi"))
+        with FileLock(folder / f"{name}.lock", timeout=LOCK_S):
+            kept = list(folder.glob(f"{name}-*.nbi"))
             newest = max(path.stat().st_mtime for path in Path(__file__).parent.glob("*.py"))
             for index in kept:  # numba only looks at the function's own file, not at those of its parts and options
                 if index.stat().st_mtime < newest:

@@ -118,8 +118,8 @@ def binned(flat: Tensor, wide: int, high: int) -> tuple[Tensor, Tensor, Tensor, 
 
 
 @inlined
-def _exp(p):
-    """exp() on [-8, 0], and what lies below as if it were -8: of p / 16, squared four times."""
+def clipped_exp(p):
+    """exp(max(p, -8)) for p of at most 0: of p / 16, squared four times."""
     q = max(p, MIN_EXPONENT) * SIXTEENTH
     r = ((((E5 * q + E4) * q + E3) * q + E2) * q + E1) * q + E0
     r = r * r
@@ -229,7 +229,7 @@ def _lay(px, py, weight, through, first, last, mx, my, a, b, c, o):
     """
     for i in range(first, last):
         dx, dy = px[i] - mx, py[i] - my
-        alpha = min(o * _exp(a * dx * dx + b * dx * dy + c * dy * dy), MAX_ALPHA)
+        alpha = min(o * clipped_exp(a * dx * dx + b * dx * dy + c * dy * dy), MAX_ALPHA)
         w = alpha * through[i] * np.float32(alpha >= MIN_ALPHA)
         weight[i] = w
         through[i] -= w
@@ -297,7 +297,7 @@ def _lift(px, py, weight, value, through, behind, first, last, mx, my, a, b, c, 
     m0, m1, m2, m11, m12, m22 = ZERO, ZERO, ZERO, ZERO, ZERO, ZERO
     for i in range(first, last):
         dx, dy = px[i] - mx, py[i] - my
-        raw = o * _exp(a * dx * dx + b * dx * dy + c * dy * dy)
+        raw = o * clipped_exp(a * dx * dx + b * dx * dy + c * dy * dy)
         alpha = min(raw, MAX_ALPHA)
         alpha *= np.float32(alpha >= MIN_ALPHA)
         w = alpha * through[i]

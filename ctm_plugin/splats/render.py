@@ -19,6 +19,8 @@ STRIDES = (1, 4)
 """Pixels from one of the three pixels whose depths :func:`bends` compares to the next."""
 EDGE_WIDTH = 0.03
 """Difference of two colours, as a share of the scene's range, at which a bend weighs 1 / e."""
+MIN_EXPONENT = -8
+"""Least exponent of a bend's weight."""
 MIN_OPACITY = 0.1
 """Least opacity of a pixel that its depth is divided by."""
 
@@ -109,7 +111,7 @@ def expected_depth(
 def bends(
     inverse: Float[Tensor, "h w"], stopped: Float[Tensor, "h w"], colors: Float[Tensor, "h w k"]
 ) -> Float[Tensor, ""]:
-    """Measure how far surfaces are from planes: the mean of ``|d(p - s) - 2 d(p) + d(p + s)| exp(-e / 0.03) W / s``.
+    """Measure how far surfaces are from planes, the mean of ``|d(p-s) - 2 d(p) + d(p+s)| exp(-min(e / 0.03, 8)) W / s``.
 
     d is the inverse depth, which is linear across the picture of a plane; s goes one way and the other; e is the larger
     of the two differences of colour. Large at a fold within one colour, nearly nothing where the picture has an edge.
@@ -127,6 +129,6 @@ def bends(
                 before, here, after = (surface.narrow(axis, i * stride, count) for i in range(3))
                 first, middle, last = (colors.narrow(axis, i * stride, count) for i in range(3))
                 edge = torch.maximum((middle - first).abs().mean(-1), (last - middle).abs().mean(-1))
-                fold = (before - 2 * here + after).abs() * (-edge / EDGE_WIDTH).exp()
+                fold = (before - 2 * here + after).abs() * (-edge / EDGE_WIDTH).clamp_min(MIN_EXPONENT).exp()
                 terms.append(fold.mean() * (surface.shape[1] / stride / len(STRIDES)))
     return sum(terms, inverse.new_zeros(()))

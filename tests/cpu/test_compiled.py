@@ -6,6 +6,7 @@ import subprocess
 import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
 from pathlib import Path
 
 import numba
@@ -150,12 +151,14 @@ def test_code_for_another_processor_is_not_used(first, kept, tmp_path):
     assert outcomes == [True, True, False, False]
 
 
-def test_one_process_compiles_at_a_time(kept, tmp_path):
-    """Several that write numba's files at once may leave one function's code under the key of another."""
-    (lock,) = {path.parent for path in kept.rglob("weights.*.nbi")}
+def test_one_process_at_a_time_compiles_a_function(kept, tmp_path):
+    """Several that write numba's files at once may leave one signature's code under the key of another."""
+    locks = [*kept.rglob("weights.*.lock")]
     for path in kept.rglob("*.nb?"):
         path.unlink()
-    with FileLock(lock / "ctm_plugin.lock"):
+    with ExitStack() as held:
+        for each in locks:
+            held.enter_context(FileLock(each))
         script = SCRIPT.replace("print", "print('imported', flush=True)\nprint", 1)
         waiting = Command(script, main=execute, told=tmp_path / "told", NUMBA_CACHE_DIR=str(kept))
         until = time.monotonic() + 60
