@@ -157,6 +157,7 @@ def test_arguments_come_from_the_command_line(monkeypatch, capsys):
 # Ends
 
 
+@pytest.mark.slow
 def test_every_failed_job_of_a_sweep_is_told_and_the_others_run(small, capsys):
     assert main(["-m", *small, "seed=0,-1", "ctm=on", "ctm.k=3,0", "hydra.sweep.dir=all"]) == 1
     error = capsys.readouterr().err
@@ -171,6 +172,7 @@ def test_every_failed_job_of_a_sweep_is_told_and_the_others_run(small, capsys):
     assert [run.name for run in runs(Path("all"))] == ["0_blender_dvgo_ctm-on_seed0"]
 
 
+@pytest.mark.slow
 def test_ctrl_c_ends_a_sweep(small, monkeypatch, capsys):
     begun = []
 

@@ -12,7 +12,7 @@ import shlex
 import subprocess
 import sys
 import tomllib
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import wraps
 from pathlib import Path
 from typing import NamedTuple
@@ -195,12 +195,8 @@ def begun(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[str]:
 CHOICES = [(group, choice) for group in GROUPS for choice in listing.choices(conf_dir(), group)]
 
 
-def slow(values: Iterable, of: Callable[..., bool]) -> list:
-    """The values as parameters, those of a kind marked as slow."""
-    return [pytest.param(*each, marks=[pytest.mark.slow] * of(*each)) for each in values]
-
-
-@pytest.mark.parametrize(("group", "choice"), slow(CHOICES, lambda group, _: group == "experiment"))
+@pytest.mark.slow
+@pytest.mark.parametrize(("group", "choice"), CHOICES)
 def test_choice(group, choice, begun, composed):
     """With a folder where it needs one; a table's rows are a sweep."""
     path = conf_dir() / group / f"{choice}.yaml"
@@ -306,10 +302,14 @@ FIRST_PAGES = ("README.md", "photographs.md")
 TYPED_COMMANDS = {command.words: command for page in reversed(TYPED) for command in commands(page)}
 
 
-PAGE_COMMANDS = [(each,) for words, each in TYPED_COMMANDS.items() if words[0] not in OF_OTHERS]
+PAGE_COMMANDS = [each for words, each in TYPED_COMMANDS.items() if words[0] not in OF_OTHERS]
 
 
-@pytest.mark.parametrize("command", slow(PAGE_COMMANDS, lambda each: each.page.name not in FIRST_PAGES), ids=str)
+@pytest.mark.parametrize(
+    "command",
+    [pytest.param(each, marks=[pytest.mark.slow] * (each.page.name not in FIRST_PAGES)) for each in PAGE_COMMANDS],
+    ids=str,
+)
 def test_command(command, begun):
     program, *words = command.words
     PROGRAMS[program.removeprefix(".venv/bin/")](words)

@@ -13,6 +13,8 @@ import torch
 import ctm_plugin
 from ctm_plugin.runs.compose import conf_dir
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(ctm_plugin.__file__).parent
 NAMES = sorted(path.relative_to(ROOT).as_posix() for path in ROOT.rglob("*.py"))
 SHOWING = sorted(path for path in ROOT.rglob("*.py") if ">>>" in path.read_text())

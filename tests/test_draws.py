@@ -44,6 +44,7 @@ def of_package() -> list[tuple[str, str]]:
     return [(name, "".join(each.value.value for each in given if each.arg == "stream")) for name, given in drawing]
 
 
+@pytest.mark.slow
 def test_no_two_streams_share_numbers():
     names = sorted({stream for _, stream in of_package()})
     assert {"", "colors", "views"} < {*names}

@@ -5,6 +5,8 @@ import re
 import pytest
 from pages import LINK, PAGES, load, name_of, prose
 
+pytestmark = pytest.mark.slow
+
 tables = load("docs/evidence/tables.py")
 MEASURED = re.compile(
     r"(?<![\w.,/^-])[-+]?(?:\d+\.\d+(?![\w.])|\d[\d,]*(?:\s?%|(?:\s|-)(?:dB|s|ms|seconds?|minutes?|hours?|GiB|MiB|GB|MB|times)\b))"

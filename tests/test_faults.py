@@ -16,13 +16,14 @@ from ctm_plugin.errors import CheckpointError
 from ctm_plugin.runs.rundir import CONFIG, DAMAGED, LAST, METRICS, PREVIOUS, locked, save_config
 from ctm_plugin.runs.train import resume, train
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def config(composed):
     return composed(*ARGUMENTS)
 
 
-@pytest.mark.slow
 def test_killed_at_random_moments(config, tmp_path):
     killer = Killer(config, tmp_path)
     assert differences(tmp_path / "again", killer.whole) == []
@@ -104,7 +105,6 @@ def test_a_full_disk(config, whole, tmp_path, monkeypatch, capsys):
     assert differences(run, whole) == []
 
 
-@pytest.mark.slow
 def test_a_second_process_is_refused(finished):
     with locked(finished):
         second = Command(f"resume={finished}", told=finished.with_name("told"))
@@ -141,7 +141,6 @@ def test_sigterm_while_scoring(whole, tmp_path, monkeypatch):
     assert differences(run, whole) == []
 
 
-@pytest.mark.slow
 def test_four_runs_at_once(tmp_path):
     """They share a data set and the folder for their output."""
     sizes = ("backbone.coarse=false", "backbone.steps_alone=2", "backbone.grow=[]", "ctm=off", "dataset.skip=20")

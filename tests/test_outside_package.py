@@ -59,6 +59,7 @@ def test_it_is_listed(installed, tmp_path):
         assert any(name in words[:2] and words[-2:] == ["from", "outside-package"] for words in shown)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ctm", ["off", "quick"])
 def test_a_space_is_fitted_once_and_its_numbers_are_in_the_checkpoint(ball, monkeypatch, capsys, ctm):
     run = trained(ball, f"ctm={ctm}", "trainer.checkpoint_every=2")

@@ -12,6 +12,8 @@ from ctm_plugin.runs.compose import GROUPS, conf_dir
 from ctm_plugin.settings.commands import explained
 from ctm_plugin.settings.listing import choices
 
+pytestmark = pytest.mark.slow
+
 KEYED = (*(group for group in GROUPS if group != "experiment"), "budget", "ctm_for")
 CHOICES = [(group, choice) for group in KEYED for choice in choices(conf_dir(), group)]
 

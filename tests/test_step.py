@@ -26,6 +26,7 @@ def step(monkeypatch):
     return module
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("backbone", "given"), [("dvgo", DVGO), ("barf2d", PLANAR)])
 def test_figures_agree_with_one_another(step, backbone, given, ball, tmp_path, capsys):
     data = [] if backbone == "barf2d" else ["dataset=blender", f"dataset.root={ball}"]

@@ -202,7 +202,7 @@ def test_pixels_that_the_patches_do_not_have(scene, pixels):
 # Runs
 
 
-@pytest.mark.parametrize("pixels", ["null", "100"])
+@pytest.mark.parametrize("pixels", ["100", pytest.param("null", marks=pytest.mark.slow)])
 def test_an_interrupted_run_ends_as_a_whole_one(compose, overrides, tmp_path, ctrl_c, pixels):
     config = compose(*overrides, f"backbone.pixels={pixels}")
     train(config, tmp_path / "whole")
@@ -233,6 +233,7 @@ def test_a_run_directory(compose, overrides, tmp_path):
     assert all(again[key] == result[key] for key in ("warp_error", "psnr", "image_psnr"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("space", ["rgb", "lab", "hsv_cart", "log"])
 @pytest.mark.parametrize("ctm", ["off", "on"])
 def test_colour_spaces(compose, overrides, tmp_path, space, ctm):

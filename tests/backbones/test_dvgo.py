@@ -83,6 +83,7 @@ def grown(compose, tmp_path, monkeypatch):
     return run
 
 
+@pytest.mark.slow
 def test_growing_as_dvgo_does(grown):
     """Adam begins anew, rates where they were at first, and each growth takes 1 off the shift, in checkpoints too."""
     seen = grown("backbone.restart=true", "backbone.shift_drop=1.0", "backbone.lr_decay_steps=10")

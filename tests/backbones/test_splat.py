@@ -55,6 +55,7 @@ def stepped(module: Splat) -> dict[str, Tensor]:
     return module.terms
 
 
+@pytest.mark.slow
 def test_pictures_with_more_pixels_have_no_gaps(scene, monkeypatch):
     """Of specks far below a pixel, twice as wide pictures, averaged, are the pictures of the training's size."""
     module, views = make(scene), scene.test
@@ -275,7 +276,7 @@ def test_the_run_grows_and_has_its_optimizers(grown):
     assert saved["state_dict"]["grad2d_count"].max() > 0
 
 
-@pytest.mark.parametrize("batch", [4, 13, 19, 33])
+@pytest.mark.parametrize("batch", [13, *(pytest.param(each, marks=pytest.mark.slow) for each in (4, 19, 33))])
 def test_an_interrupted_run_goes_on_to_the_bit(grown, tmp_path, ctrl_c, batch):
     """Before anything grew and after, just before the reset and long after it."""
     config, whole = grown
@@ -416,9 +417,9 @@ SPACES = ["log", "hsv_cart", "lab"]
 @pytest.mark.parametrize(
     "chosen",
     [
-        *(("ctm=off", f"color_space={space}") for space in SPACES),
-        ("ctm=on",),
-        ("ctm=quick", "color_space=gain"),
+        *(pytest.param(("ctm=off", f"color_space={space}"), marks=pytest.mark.slow) for space in SPACES),
+        pytest.param(("ctm=on",), marks=pytest.mark.slow),
+        pytest.param(("ctm=quick", "color_space=gain"), marks=pytest.mark.slow),
         ("ctm=auto",),
         ("ctm=on", "ctm.k=5", "loss=mse"),
         ("ctm=quick", "appearance=exposure", "backbone.bend=0.1", "trainer.accumulate_grad_batches=2"),

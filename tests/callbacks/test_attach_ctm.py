@@ -84,6 +84,7 @@ def test_it_learns_with_two_optimizers_under_one_step():
     assert "configure_optimizers" not in vars(module)
 
 
+@pytest.mark.slow
 def test_its_checkpoint_goes_on_and_nothing_is_fitted_anew(tmp_path, monkeypatch):
     made = fit(CoordinateMLP(channels=4), epochs=2)
     made.save_checkpoint(tmp_path / "x.ckpt")

@@ -76,7 +76,7 @@ def test_there_is_a_longest_and_a_shortest_training(compose, tmp_path, speed, se
     assert checkpoint(tmp_path / "run")["global_step"] == pytest.approx(steps, rel=0.1)
 
 
-@pytest.mark.parametrize("batch", [3, 60])
+@pytest.mark.parametrize("batch", [60, pytest.param(3, marks=pytest.mark.slow)])
 def test_an_interrupted_run_goes_on_to_the_bit(compose, tmp_path, speed, ctrl_c, batch):
     """What was decided is in the checkpoint, and the time that is left."""
     given = config(compose, "trainer.checkpoint_every=1000")

@@ -41,7 +41,7 @@ def test_frames_of_a_clip_lie_next_to_it_and_are_used_again(walk, capsys):
     assert capsys.readouterr().out.endswith("are used; the clip is newer: remove them to take others\n")
 
 
-@pytest.mark.parametrize("home", ["", "low"])
+@pytest.mark.parametrize("home", ["", pytest.param("low", marks=pytest.mark.slow)])
 def test_clips_and_photographs_in_one_folder(walk, home):
     """Frames lie among the photographs, wherever those are, and are found there again."""
     root = walk.parent
@@ -56,6 +56,7 @@ def test_clips_and_photographs_in_one_folder(walk, home):
         assert 3 + 36 <= len(names) <= 3 + 44
 
 
+@pytest.mark.slow
 def test_two_clips_without_photographs(walk):
     other = write_clip(walk.parent / "my walk.mov", pan(range(500, 600, 2)))
     take_frames(walk.parent, "images")
@@ -92,6 +93,7 @@ def test_the_only_one_is_refused(tmp_path):
     assert [*tmp_path.iterdir()] == [clip]
 
 
+@pytest.mark.slow
 def test_a_stop_and_a_folder_that_is_shut_leave_nothing(walk, monkeypatch):
     def stopped(*_: object) -> None:
         raise KeyboardInterrupt

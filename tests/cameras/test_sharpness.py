@@ -45,6 +45,7 @@ def test_only_pictures_of_one_sensor_are_compared():
     assert unsharp(lights, ["one", "other"] * 9) == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("capture", ["lom/bike/low", "fern/images_8", "lego_400/train", "realx3d/MilkCookie/train"])
 def test_sharp_captures_lose_none(ctm_data, capture):
     paths = [path for path in below(ctm_data / capture) if is_picture(path)]

@@ -54,6 +54,7 @@ def test_it_keeps_to_torch_s_threads():
     assert seen == [min(threads, numba.config.NUMBA_NUM_THREADS) for threads in (1, 2, 64)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("torch_s", "numba_s"), [("1", "2"), ("2", "1")])
 def test_torch_s_threads_stay(torch_s, numba_s):
     """Starting numba's threads sets how many OpenMP gives to others."""

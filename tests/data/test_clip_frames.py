@@ -15,6 +15,7 @@ def grey(frames: list[np.ndarray], light: float = 1.0, noise: float = 0.0) -> li
     return [(each.round() / 255).astype(np.float32) for each in codes]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("light", "noise"), [(1.0, 0.0), (0.03, 0.5)])
 @pytest.mark.parametrize("speed", [1, 3])
 def test_movement_is_that_of_the_camera_in_the_dark_too(speed, light, noise):
@@ -39,6 +40,7 @@ def test_a_tripod_and_a_hand_that_shakes_go_nowhere(noise):
     assert choose([course(grey(shaking, 0.1, noise))]) == [[]]
 
 
+@pytest.mark.slow
 def test_frames_are_apart_by_movement_and_not_by_the_clock():
     """The camera rests for 60 frames, and goes on twice as fast."""
     places = np.concatenate([np.arange(0, 120, 1), np.full(60, 120), np.arange(120, 320, 2)])

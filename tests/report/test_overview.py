@@ -60,6 +60,7 @@ def labels(table):
     return [label for label, _ in table.rows]
 
 
+@pytest.mark.slow
 def test_a_row_for_each_transform_and_scene(swept):
     folder, scores = swept
     table = table_of(folder)
@@ -124,6 +125,7 @@ def test_what_a_scene_has_in_all_rows_is_no_row_of_its_own(made):
     assert rows == [f"room: ctm=off backbone.coarse={value}" for value in ("auto", "true")]
 
 
+@pytest.mark.slow
 def test_other_random_backgrounds_are_no_other_scene(made):
     """They are of the training alone: rows are paired across them, those of one transform are told apart."""
     data = ("dataset=blender", "dataset.root=x", "dataset.background=random", "backbone.relative=true")

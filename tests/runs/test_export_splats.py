@@ -142,6 +142,7 @@ def test_lit_splats_from_the_command_line(run, capsys, refused, tmp_path, monkey
     assert likeness(module, dark, posed.light) < 30
 
 
+@pytest.mark.slow
 def test_points_of_splats(run, tmp_path):
     """Normals have unit length and face the cameras."""
     command = ["export", str(run), "what=points", f"out={tmp_path}", "opaque=0.1", "light=off"]

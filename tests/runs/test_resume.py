@@ -82,7 +82,7 @@ def test_the_run_has_all_that_can_go_wrong(whole):
     assert 0.1 < saved["state_dict"]["field.occupancy"].float().mean() < 0.9
 
 
-@pytest.mark.parametrize("batch", [7, 23])
+@pytest.mark.parametrize("batch", [23, pytest.param(7, marks=pytest.mark.slow)])
 def test_interrupted_in_a_second_batch(whole, config, tmp_path, ctrl_c, batch):
     ctrl_c(lambda seen: seen == batch)
     run = tmp_path / "run"
@@ -109,6 +109,7 @@ def test_interrupted_in_every_step(whole, config, tmp_path, ctrl_c):
     same(run, whole)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("kind", "batch"), [("planes", 9), ("nerf", 5), ("ngp", 13), ("settled", 8)])
 def test_other_fields(compose, hall, tmp_path, ctrl_c, monkeypatch, kind, batch):
     monkeypatch.setattr("ctm_plugin.backbones.ngp.SETTLING_UPDATES", 1)
@@ -124,6 +125,7 @@ def test_other_fields(compose, hall, tmp_path, ctrl_c, monkeypatch, kind, batch)
     same(tmp_path / "run", tmp_path / "whole")
 
 
+@pytest.mark.slow
 def test_interrupted_in_pretraining_starts_again(whole, config, tmp_path, monkeypatch):
     loss, calls = CTM.cycle_loss, []
 
@@ -143,6 +145,7 @@ def test_interrupted_in_pretraining_starts_again(whole, config, tmp_path, monkey
     same(run, whole)
 
 
+@pytest.mark.slow
 def test_interrupted_while_scoring(whole, config, tmp_path, monkeypatch):
     def render_view(self, *args):
         raise KeyboardInterrupt

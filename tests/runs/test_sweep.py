@@ -107,6 +107,7 @@ def test_colors_on_every_dark_scene():
     ]  # fmt: skip
 
 
+@pytest.mark.slow
 def test_every_row_on_every_scene(recorded):
     rows, scenes = "[{loss: l1},{seed: 5}]", "[{seed: 1,ctm: 'off'},{seed: 2}]"
     assert main(["-m", f"hydra.sweeper.rows={rows}", f"hydra.sweeper.scenes={scenes}", "ctm=on", "loss=mse"]) == 0
@@ -146,6 +147,7 @@ def test_a_sweep_with_plus(recorded):
     assert sorted(path.parent.name for path in Path("all").rglob(METRICS)) == names
 
 
+@pytest.mark.slow
 def test_names_that_hydra_would_not_read(recorded, ball, capsys, refused):
     """A run, a sweep over two folders, and the command that goes on with the sweep."""
     names = ["cap (1)", "20240501"]
@@ -200,6 +202,7 @@ def test_the_table_knows_runs_by_their_configuration(recorded, capsys):
     assert second == f"{first}_2"  # another run of the same name stays
 
 
+@pytest.mark.slow
 def test_what_auto_came_to_is_no_other_run(recorded):
     assert main(["-m", "seed=0", "hydra.sweep.dir=s"]) == 0
     (run,) = (path.parent for path in Path("s").rglob(METRICS))

@@ -225,7 +225,13 @@ SHIPPED = [
 ]
 
 
-@pytest.mark.parametrize(("group", "choice"), SHIPPED)
+@pytest.mark.parametrize(
+    ("group", "choice"),
+    [
+        pytest.param(*each, marks=[pytest.mark.slow] * (each[0] in ("color_space", "loss", "experiment")))
+        for each in SHIPPED
+    ],
+)
 def test_every_shipped_choice_trains(compose, tmp_path, group, choice):
     sizes = CHOICES.get(group, {}).get(choice, OTHERWISE.get(group, ()))
     result = train(compose(f"+{group}={choice}", *sizes), tmp_path)

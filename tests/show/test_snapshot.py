@@ -51,7 +51,8 @@ class Careless(RadianceBackbone):
 
 
 @pytest.mark.parametrize(
-    "settings", [DVGO, ("backbone=nerf", "backbone.steps=8", "ctm.k=2"), PLANAR, None],
+    "settings", [DVGO, *(pytest.param(each, marks=pytest.mark.slow) for each in (
+        ("backbone=nerf", "backbone.steps=8", "ctm.k=2"), PLANAR, None))],
     ids=["dvgo", "nerf", "barf2d", "another's"],
 )  # fmt: skip
 def test_training_is_the_same_bit_for_bit(compose, tmp_path, monkeypatch, settings):
