@@ -71,7 +71,7 @@ def added(root: Path, name: str) -> list[str]:
 
 
 def too_few(root: Path, place: Path, files: Sequence[Path], count: int) -> DataError:
-    """Make the error that says why the folder ``place`` of ``root`` has too few pictures."""
+    """Make the error that says why the folder ``place`` of ``root`` has fewer than ``MIN_PICTURES``."""
     if not place.is_dir():
         there = ", ".join(sorted(path.name for path in root.iterdir() if path.is_dir())) or "no folders"
         return DataError(root, there, f"photographs in {place.name}; for others, ctm cameras FOLDER pictures=NAME")

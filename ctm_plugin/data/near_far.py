@@ -113,7 +113,7 @@ def ray_bounds(nearest: float, farthest: float, geometry: Geometry, views: Views
 def depth_bounds(depths: Sequence[Float64[np.ndarray, " _"]]) -> tuple[float, float] | None:
     """Find the nearest and farthest depth of points, given one array a camera; ``None`` where no camera sees any.
 
-    Percentiles over all cameras' points, widened to those of each camera that sees enough of them.
+    Percentiles over all cameras' points, widened to those of each camera that sees ``MIN_CAMERA_POINTS`` of them.
     """
     depths = [each[(each > 0) & (each <= MAX_COORDINATE)] for each in depths]
     if not any(len(each) for each in depths):
