@@ -47,7 +47,9 @@ def home_of(root: Path, name: str) -> Path:
 
 
 def list_photographs(root: Path, name: str) -> list[Path]:
-    """List the pictures in the photographs' folder and below, in natural order, without those of :func:`left_out`."""
+    """List the pictures in the photographs' folder and below, in natural order, without those of :func:`left_out`.
+
+    Raises a DataError for fewer than ``MIN_PICTURES``."""
     place = home_of(root, name)
     files = below(place)
     paths = [path for path in files if is_picture(path)]
