@@ -104,7 +104,7 @@ def capture_of(
     """Make the capture of these JSON files, each given with whether its frames are for testing.
 
     ``synthetic``: files of Synthetic-NeRF's kind, whose views stay in the files' order, with depth. For the other
-    arguments see :class:`TransformsConfig`. DataError: sizes are not all told, or depth is not there.
+    arguments see :class:`TransformsConfig`. DataError: sizes or depth are not given.
     """
     records = [record for record, _ in files]
     source, frames = records[0].source, [frame for record in records for frame in frames_of(record)]
