@@ -72,7 +72,7 @@ def relative_brightness(records: list[Path], raws: list[Path]) -> list[float]:
 def exposure(path: Path) -> float:
     """Shutter time in seconds x ISO / 100 out of ``exiftool -json``'s output: a list of one object, or the object.
 
-    Raises a DataError unless both are numbers > 0.
+    Without ISO it is taken for 100. Raises a DataError for other values and without a shutter time.
     """
     exif = read_record(path)
     expected = "the shutter time in seconds, a number or a text such as 1/30"
