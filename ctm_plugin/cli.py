@@ -59,7 +59,7 @@ MAIN_GROUPS = ("dataset", "backbone", "ctm", "trainer")
 
 
 def run(config: DictConfig) -> float | None:
-    """Run one job, single or of a sweep; returns its PSNR, for sweepers that search."""
+    """Run one job, single or of a sweep; returns its PSNR, for sweepers that search, and raises what the job raises."""
     from ctm_plugin.cpu.allocator import give_back
     from ctm_plugin.runs.decide import decide
     from ctm_plugin.runs.processes import is_main_process
@@ -150,7 +150,7 @@ def _run(arguments: list[str]) -> None:
 def print_list(*groups: Path, others: Sequence[str] = ()) -> None:
     """Print every choice of every group in a line each, or the keys of the groups given as GROUP or GROUP=CHOICE.
 
-    GROUP=CHOICE also prints the choice's description.
+    GROUP=CHOICE also prints the choice's description. Raises a ConfigError for other names.
     """
     named = [*map(str, groups), *others]
     if not named:

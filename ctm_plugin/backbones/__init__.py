@@ -1,0 +1,1 @@
+"""Fields that train through a colour transform, and how they are scored and shown."""

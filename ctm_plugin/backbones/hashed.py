@@ -70,7 +70,7 @@ class HashField(OccupiedField):
         return log_density(*self._looked_up(), self.space.unit(points))
 
     def reached(self, t: Tensor, ray_index: Tensor, points: Tensor, n_rays: int) -> tuple[Tensor, ...]:
-        """Indices ``[N]`` of the M samples with alpha that light reaches, and their features; others hardly matter."""
+        """Keep the N samples with alpha that light reaches, and give their features, ``[N, F]``, too."""
         lengths = self.space.lengths(t, points)
         lengths = lengths if isinstance(lengths, Tensor) else t.new_full((1,), lengths)
         unit = self.space.unit(points)

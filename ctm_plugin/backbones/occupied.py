@@ -81,7 +81,7 @@ class OccupiedField(nn.Module):
         raise NotImplementedError
 
     def reached(self, t: Tensor, ray_index: Tensor, points: Tensor, n_rays: int) -> tuple[Tensor, ...]:
-        """Indices ``[N]`` of the samples of ``n_rays`` rays that are worth a gradient, and tensors known at them."""
+        """Keep samples worth a gradient: ``t`` ``[N]``, ``ray_index``, ``points``, what is known there; here all M."""
         return t, ray_index, points
 
     def samples(self, rays: Rays, offset: Tensor | float, cells: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor]:

@@ -116,7 +116,7 @@ class PosedBackbone(Backbone):
         raise CTMError(f"{type(self).__name__} has no method query, which gives densities at points")
 
     def world_box(self) -> Float[Tensor, "2 3"]:
-        """What a mesh is made of: all that training views see up to far; of unbounded scenes the ball of cameras."""
+        """Box of what a mesh is made of: what training views see up to far; of unbounded scenes the cameras' ball."""
         scene = self.scene
         if scene.geometry != "unbounded":
             return frustum_box(scene.train, scene.near, scene.far)

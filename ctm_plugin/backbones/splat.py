@@ -160,7 +160,7 @@ class Splat(PictureBackbone):
         self.set_range(float(spans[0][0].min()), max(widest, MIN_RANGE))
 
     def set_range(self, low: float, span: float) -> None:
-        """Let the latents from ``low`` to ``low + span`` be 0 to 1 of what Gaussians render."""
+        """Let the latents from ``low`` to ``low + span > low`` be 0 to 1 of what Gaussians render, else ValueError."""
         if not (math.isfinite(low) and 0 < span < math.inf):
             raise ValueError(f"colours from {low} over {span}")
         self.low, self.range = low, span

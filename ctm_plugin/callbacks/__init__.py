@@ -1,0 +1,1 @@
+"""Callbacks of a training: checkpoints, the dashboard, what ends it, the transform's optimizer."""

@@ -77,7 +77,7 @@ class LastCheckpoint(L.Callback):
 
     @contextmanager
     def stopping_at_once(self, when: str) -> Iterator[None]:
-        """Context in which SIGTERM ends at once work that needs no saving, such as scoring."""
+        """Context in which SIGTERM raises Interrupted at once, for work that needs no saving, such as scoring."""
 
         def stop(number: int, frame: Any) -> None:
             raise Interrupted(when, self.run, number)

@@ -43,7 +43,7 @@ def network() -> nn.Module:
 
 @torch.inference_mode()
 def find_details(grey: Float32[Tensor, "h w"]) -> tuple[Float32[Tensor, "n 2"], Float32[Tensor, "n 64"]]:
-    """Find the best keypoints of a picture by XFeat: column and row in pixels, and descriptors of length 1.
+    """Find the ``MAX_DETAILS`` best keypoints of a picture by XFeat: column and row in pixels, descriptors of length 1.
 
     A keypoint is a peak of the network's heat map, at the weighted middle of its surroundings. It is ranked by heat map
     times reliability map.
@@ -68,7 +68,8 @@ def find_details(grey: Float32[Tensor, "h w"]) -> tuple[Float32[Tensor, "n 2"], 
 
 @torch.inference_mode()
 def nearest_to_each_other(first: Float32[Tensor, "n d"], second: Float32[Tensor, "m d"]) -> Int64[Tensor, "p 2"]:
-    """Match two pictures' descriptors: pairs of rows that are mutual nearest neighbours and similar enough."""
+    """Match two pictures' descriptors: pairs of rows that are mutual nearest neighbours, their cosine above
+    ``MIN_COSINE``."""
     cosine = first @ second.T
     if not cosine.numel():
         return torch.empty(0, 2, dtype=torch.long)

@@ -24,7 +24,7 @@ def all_pairs(count: int) -> list[tuple[int, int]]:
 
 
 def likely_pairs(looks: Sequence[Float32[Tensor, "n d"]]) -> list[tuple[int, int]]:
-    """Choose pairs of pictures that probably show the same thing: with many :func:`votes`, or near by name.
+    """Choose pairs of pictures that probably show the same thing: ``PARTNERS`` each by :func:`votes`, or near by name.
 
     The ring of names closes captures that go round; steps that double tie passes that lie far apart by name.
 

@@ -47,7 +47,9 @@ def home_of(root: Path, name: str) -> Path:
 
 
 def list_photographs(root: Path, name: str) -> list[Path]:
-    """List the pictures in the photographs' folder and below, in natural order, without those of :func:`left_out`."""
+    """List the pictures in the photographs' folder and below, in natural order, without those of :func:`left_out`.
+
+    Raises a DataError for fewer than ``MIN_PICTURES``."""
     place = home_of(root, name)
     files = below(place)
     paths = [path for path in files if is_picture(path)]
@@ -71,7 +73,7 @@ def added(root: Path, name: str) -> list[str]:
 
 
 def too_few(root: Path, place: Path, files: Sequence[Path], count: int) -> DataError:
-    """Make the error that says why the folder ``place`` of ``root`` has too few pictures."""
+    """Make the error that says why the folder ``place`` of ``root`` has fewer than ``MIN_PICTURES``."""
     if not place.is_dir():
         there = ", ".join(sorted(path.name for path in root.iterdir() if path.is_dir())) or "no folders"
         return DataError(root, there, f"photographs in {place.name}; for others, ctm cameras FOLDER pictures=NAME")

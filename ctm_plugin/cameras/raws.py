@@ -85,7 +85,10 @@ def sensor_of(header: RawHeader) -> tuple[object, ...]:
 
 
 def find_hot(headers: Mapping[Path, RawHeader]) -> dict[tuple[object, ...], Bool[np.ndarray, "h w"] | None]:
-    """Each sensor's hot pixels, by some of its pictures; ``None``: there are too few, or it has no Bayer pattern."""
+    """Each sensor's hot pixels, by at most ``MOST_OF_A_SENSOR`` of its pictures.
+
+    ``None``: there are fewer than ``LEAST_OF_A_SENSOR``, or it has no Bayer pattern.
+    """
     sensors = defaultdict(list)
     for path, header in headers.items():
         sensors[sensor_of(header)].append(path)

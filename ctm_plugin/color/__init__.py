@@ -1,0 +1,1 @@
+"""Colour spaces, learned transforms, light, and the loss between colours."""

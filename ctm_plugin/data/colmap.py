@@ -91,7 +91,10 @@ def tell_of_others(folder: Path, known: int) -> None:
 
 
 def picture_folder(root: Path, config: ColmapConfig, names: Sequence[str]) -> tuple[Path, bool]:
-    """Find the pictures: in ``config.images``, else ``images``, else the only folder with the names, else ``root``."""
+    """Find the pictures: in ``config.images``, else ``images``, else the only folder with the names, else ``root``.
+
+    Raises a DataError where ``config.images`` is not there, or several folders have the names.
+    """
     if config.images is not None:
         folder = inside(root, config.images, root)
         if not folder.is_dir():

@@ -60,7 +60,7 @@ def develop(
 
     Pictures that are not there are black, without any alpha; one is there at least. Noise is decided by the seed and
     the view's name. ``canvas`` is the height and width in whose upper left corner
-    images of several sizes lie once they have shrunk, 0 outside them.
+    images of several sizes lie once they have shrunk, 0 outside them. Raises a DataError where memory is too small.
     """
     there = [index for index, picture in enumerate(pictures) if picture]
     headers, folder = [pictures[index].header for index in there], pictures[there[0]].path.parent
@@ -123,6 +123,7 @@ def develop_masks(
 
     In instant-ngp's masks (``DYNAMIC_PREFIX``) the black area counts. Pixels of the canvas outside an image never
     count. Where a mask is transparent somewhere, its alpha stands for its brightness. ``None`` where all pixels count.
+    Raises a DataError for a mask in which none counts.
     """
     if not any(paths) and {*sizes} == {canvas}:
         return None

@@ -47,7 +47,7 @@ class LLFFConfig(Layout, LLFFSettings):
         return [read_picture(path) for path in list_pictures(root, folder)], shrunk
 
     def posed(self, root: Path, pictures: list[PictureFile], shrunk: bool) -> Capture:
-        """Put pictures and the rows of ``poses_bounds.npy`` together, one for each in the order of their names."""
+        """Put pictures, by name, and the rows of ``poses_bounds.npy`` together; DataError: numbers differ."""
         source, paths = inside(root, LLFF_FILE), [picture.path for picture in pictures]
         c2w, hwf, bounds = read_poses(source, bounded=self.near is None or self.far is None)
         if len(paths) != len(c2w):
@@ -98,6 +98,7 @@ def read_poses(
     """Read poses: camera to world, OpenGL axes; (height, width, focal length) in pixels; the bounds if ``bounded``.
 
     Bounds of pictures that see no points, zeros, NaN or infinity in the file, are NaN here; ``None`` where all are.
+    Raises a DataError for another shape, NaN in a pose, or numbers that are no camera's.
     """
     expected = "an array [N, 17] of finite numbers: a 3x5 matrix, near and far of each view"
     rows = map_numbers(source, expected)
@@ -129,7 +130,7 @@ def read_poses(
 
 
 def find_depths(root: Path, pictures: list[Path], testing: Bool[np.ndarray, " n"]) -> list[Path | None]:
-    """Find the files of distances along the rays, of test views; none where there is no folder ``depth``."""
+    """Find the files of distances along the rays, one for each test view, else a DataError; none without ``depth/``."""
     folder = root / "depth"
     paths: list[Path | None] = [None] * len(pictures)
     for row in np.flatnonzero(testing) if folder.is_dir() else ():

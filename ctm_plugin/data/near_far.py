@@ -46,7 +46,10 @@ UNTOLD, SET = "no near and far there", "dataset.near and dataset.far set them"
 
 
 def near_far(capture: Capture, config: BoundsConfig, views: Sequence[Views]) -> tuple[float, float]:
-    """Choose near and far: of the configuration, else of the first file that has them, else :func:`found_bounds`."""
+    """Choose near and far: of the configuration, else of the first file that has them, else :func:`found_bounds`.
+
+    Raises a DataError unless near < far.
+    """
     near, far = (given(capture, config, key) for key in ("near", "far"))
     if near is None or far is None:
         bounds = found_bounds(capture, config.geometry, views)
@@ -113,7 +116,7 @@ def ray_bounds(nearest: float, farthest: float, geometry: Geometry, views: Views
 def depth_bounds(depths: Sequence[Float64[np.ndarray, " _"]]) -> tuple[float, float] | None:
     """Find the nearest and farthest depth of points, given one array a camera; ``None`` where no camera sees any.
 
-    Percentiles over all cameras' points, widened to those of each camera that sees enough of them.
+    Percentiles over all cameras' points, widened to those of each camera that sees ``MIN_CAMERA_POINTS`` of them.
     """
     depths = [each[(each > 0) & (each <= MAX_COORDINATE)] for each in depths]
     if not any(len(each) for each in depths):
@@ -164,7 +167,10 @@ def camera_bounds(c2w: Float64[np.ndarray, "n 3 4"], geometry: Geometry) -> tupl
 def bounds_of_cameras(
     capture: Capture, geometry: Geometry, source: Path, missing: str, remarks: str = ""
 ) -> tuple[float, float]:
-    """Guess near and far from only the cameras, with one warning: what ``source`` lacks, why other sources fail."""
+    """Guess near and far from only the cameras, with one warning: what ``source`` lacks, why other sources fail.
+
+    Raises a DataError for cameras at one place.
+    """
     if (bounds := camera_bounds(capture.c2w, geometry)) is None:
         raise DataError(source, f"{missing}, all cameras at one place", "some, or dataset.near and dataset.far")
     warning = "{:.3g} and {:.3g} are taken from where the cameras stand and look".format(*bounds)

@@ -30,7 +30,7 @@ MASK_FOLDERS = ("mask", "image_masks", "images_mask", "images_masks")
 
 
 def list_pictures(root: Path, folder: Path) -> list[Path]:
-    """The pictures in a folder of the data set's, in the order of their names."""
+    """The pictures in a folder of the data set's, in the order of their names; DataError: there are none."""
     names = sorted(path.name for path in folder.iterdir() if is_picture(path))
     if not names:
         there = sorted(folder.iterdir())
@@ -44,6 +44,7 @@ def find_pictures(root: Path, whole_factor: int, factor: int | None = None) -> t
     """Find the pictures' folder: ``images_<whole_factor>``, else ``images``; with ``factor`` ``images_<factor>``.
 
     The second result is whether its pictures have been shrunk by ``dataset.downscale`` already.
+    DataError: no such folder.
     """
     if factor is None and has_shrunk(root, whole_factor):
         return root / f"images_{whole_factor}", True
@@ -72,7 +73,8 @@ def has_shrunk(root: Path, whole_factor: int) -> bool:
 def masks_beside(root: Path, names: Sequence[PurePath]) -> list[Path | None]:
     """Find masks: ``masks/NAME.EXT.png``, COLMAP's, ``NAME.png`` or ``NAME_mask.png``, in any case, of any kind.
 
-    Names are those in the pictures' own folder; pictures without a mask count whole, with one warning.
+    Names are those in the pictures' own folder; pictures without a mask count whole, with one warning;
+    a DataError where none has one.
     """
     folder = folded(root).get("masks")
     if folder is None or not folder.is_dir():
@@ -102,7 +104,7 @@ def masks_beside(root: Path, names: Sequence[PurePath]) -> list[Path | None]:
 def find_listed(root: Path, name: str, source: Path) -> Path | None:
     """The picture that ``source`` calls ``name``, also with another suffix; ``None`` where there is none.
 
-    Files in formats that are read here go before others: ``a.jpg`` before ``a.BMP``.
+    Files in formats that are read here go before others: ``a.jpg`` before ``a.BMP``. DataError: only a raw picture.
     """
     path = PurePosixPath(plain_name(name))
     file = look_for(root, name, source)
@@ -115,7 +117,10 @@ def find_listed(root: Path, name: str, source: Path) -> Path | None:
 
 
 def existing(root: Path, paths: Sequence[Path | None], names: Sequence[str], source: Path) -> list[int]:
-    """Indices of the listed pictures whose files exist; one warning counts the others by their names in ``source``."""
+    """Indices of the listed pictures whose files exist; one warning counts the others by their names in ``source``.
+
+    Raises a DataError for fewer than ``MIN_PHOTOGRAPHS``.
+    """
     missing = [name for path, name in zip(paths, names, strict=True) if path is None]
     left = len(names) - len(missing)
     if left < MIN_PHOTOGRAPHS:

@@ -53,7 +53,7 @@ class PlanarConfig(PlanarSettings):
 
 
 def photograph(image: str | Path) -> Path:
-    """Find a photograph's file: one of scikit-image's by name, else the path itself."""
+    """Find a photograph's file: one of scikit-image's by name, else the path; DataError: a folder, a raw picture."""
     if str(image) in PHOTOGRAPHS:
         return Path(str(files("skimage.data").joinpath(PHOTOGRAPHS[str(image)])))
     path = Path(image)

@@ -109,7 +109,10 @@ def ply_named(root: Path, record: Record) -> PointsOrReason:
 
 
 def points_of(cloud: Cloud, names: Sequence[str]) -> Points | None:
-    """Points in the world of the data set's poses, without those that too few training views see; ``None``: none."""
+    """Points in the world of the data set's poses, of which ``MIN_VIEWS`` training views, called ``names``, see each.
+
+    Where no point has so many, one view will do. Points beyond ``MAX_COORDINATE`` are left out; ``None``: none is left.
+    """
     tracks = {picture.name: track for picture, track in zip(cloud.taken, cloud.tracks, strict=True)}
     seen = [tracks.get(name, np.empty(0, np.int64)) for name in names]
     point, view = np.concatenate(seen), np.repeat(np.arange(len(names)), [len(each) for each in seen])

@@ -60,6 +60,7 @@ def relative_brightness(records: list[Path], raws: list[Path]) -> list[float]:
     ``e`` is the shutter time x ISO, by each picture's EXIF data as JSON, or without these files what each picture says
     itself. A field has one colour for each point, whatever the shutter did. The longest is the reference, as in
     RawNeRF: what it clips is clipped in all. Where a picture has no exposure, all factors are 1.
+    DataError: some have JSON, not all.
     """
     missing = [record for record in records if not record.exists()]
     if missing and len(missing) < len(records):
@@ -69,7 +70,10 @@ def relative_brightness(records: list[Path], raws: list[Path]) -> list[float]:
 
 
 def exposure(path: Path) -> float:
-    """Shutter time in seconds x ISO / 100 out of ``exiftool -json``'s output: a list of one object, or the object."""
+    """Shutter time in seconds x ISO / 100 out of ``exiftool -json``'s output: a list of one object, or the object.
+
+    Without ISO it is taken for 100. Raises a DataError for other values and without a shutter time.
+    """
     exif = read_record(path)
     expected = "the shutter time in seconds, a number or a text such as 1/30"
     seconds, _, parts = str(exif.values.get("ShutterSpeed")).partition("/")

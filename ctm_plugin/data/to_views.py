@@ -24,7 +24,9 @@ from ctm_plugin.scene.views import Views
 
 
 def develop_photographs(capture: Capture, config: BoundsConfig) -> tuple[Views, Views]:
-    """Develop a capture's photographs into training views, thinned by ``config.skip``, and test views."""
+    """Develop a capture's photographs into training views, thinned by ``config.skip``, and test views.
+
+    Raises a DataError without either, a ConfigError for ``random_matched`` without alpha."""
     source, photographs = capture.source, upright(capture.photographs, capture.source)
     headers = headers_of(photographs)
     photo = replace(config, downscale=1) if capture.shrunk else config
@@ -119,7 +121,10 @@ def on_one_canvas(
 
 
 def camera_of(photograph: Photograph, header: Header, source: Path) -> Intrinsics:
-    """Intrinsics of a photograph, upright, see :meth:`~ctm_plugin.data.readers.lens.Intrinsics.of_picture`."""
+    """Intrinsics of a photograph, upright, see :meth:`~ctm_plugin.data.readers.lens.Intrinsics.of_picture`.
+
+    Raises a DataError where EXIF turns the picture away from its camera.
+    """
     path, camera, (height, width, *_) = photograph.path, photograph.camera, header
     turned = photograph.shown or (header.orientation > 4 and (width - height) * (camera.width - camera.height) > 0)
     if header.orientation != UPRIGHT_ORIENTATION and not turned:
@@ -146,7 +151,11 @@ def exposures_told(headers: Sequence[Header]) -> Float32[Tensor, " n"] | None:
 def develop_lit(
     photographs: Sequence[Photograph], config: PhotoConfig, sizes: Sequence[tuple[int, int]], canvas: tuple[int, int]
 ) -> UInt8[Tensor, "n h w 3"] | None:
-    """Develop the lit references of test views, shrunk like their pictures, not dimmed; ``None`` without any."""
+    """Develop the lit references of test views, shrunk like their pictures, not dimmed; ``None`` without any.
+
+    ``sizes`` are height and width of the shrunk pictures, else a DataError; ``canvas`` holds each, see
+    :func:`~ctm_plugin.data.develop.develop`.
+    """
     pictures = [photograph.lit for photograph in photographs if photograph.lit is not None]
     if not pictures:
         return None

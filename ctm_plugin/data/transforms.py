@@ -104,7 +104,7 @@ def capture_of(
     """Make the capture of these JSON files, each given with whether its frames are for testing.
 
     ``synthetic``: files of Synthetic-NeRF's kind, whose views stay in the files' order, with depth. For the other
-    arguments see :class:`TransformsConfig`.
+    arguments see :class:`TransformsConfig`. DataError: sizes or depth are not given.
     """
     records = [record for record, _ in files]
     source, frames = records[0].source, [frame for record in records for frame in frames_of(record)]
@@ -168,7 +168,7 @@ def list_frames(
     """List all frames, file after file in this order, without those that a file's lists leave out.
 
     ``test_filenames``, else ``val_filenames`` are for testing, and ``train_filenames``, else all others for training;
-    with only ``train_filenames``, all others are for testing.
+    with only ``train_filenames``, all others are for testing. Raises a ConfigError for training pictures in ``lit``.
     """
     dark, lit = (None if name is None else plain_name(name) for name in (dark, lit))
     listed = []
@@ -215,7 +215,7 @@ def resized(root: Path, name: str, factor: int) -> str:
 
 
 def split(listed: list[Listed], source: Path, test_every: int) -> tuple[list[Listed], list[Listed]]:
-    """Choose the frames to train on and those for testing.
+    """Choose the frames to train on and those for testing; at least one for each, else a DataError.
 
     Where no file tells them apart, every ``test_every``-th of those whose pictures are there is for testing.
     """
@@ -245,7 +245,11 @@ def split(listed: list[Listed], source: Path, test_every: int) -> tuple[list[Lis
 
 
 def photograph(root: Path, each: Listed, camera: Intrinsics, picture: PictureFile | None, factor: int) -> Photograph:
-    """Make the photograph of a frame, with its mask, out of ``masks_<factor>`` where there is such a folder."""
+    """Make the photograph of a frame, with its mask and, for testing, its lit reference.
+
+    The mask is the frame's ``mask_path``, shrunk by ``factor`` where ``masks_<factor>`` is there, else instant-ngp's
+    next to the picture. Raises a DataError where a mask or reference that the file names is not there.
+    """
     source, mask, lit = each.record.source, None, None
     if each.frame.values.get("mask_path"):
         name = plain_name(each.frame.text("mask_path", "the path of a picture"), root)

@@ -1,0 +1,1 @@
+"""Loggers: where curves, pictures and scores go."""

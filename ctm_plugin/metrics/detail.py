@@ -42,7 +42,7 @@ def detail_moments(
 
     Returns:
         Sums over pixels of: rendered times photographed, rendered squared, photographed squared, and noise
-        (:func:`noise_variance`); ``None`` where too few squares count.
+        (:func:`noise_variance`); ``None`` where fewer than ``MIN_SQUARES`` count.
     """
     pair = torch.stack([each.float().mean(-1) for each in (rendered, photograph)])
     pair = pair if mask is None else pair.where(mask, 0.0)
@@ -109,7 +109,7 @@ def detail(moments: Sequence[Float64[Tensor, " 4"]]) -> float | None:
         moments: see :func:`detail_moments`, of all views; they are added.
 
     Returns:
-        In [0, 1]; 0 for a rendering without any detail, ``None`` where noise is not known well enough.
+        In [0, 1]; 0 for a rendering without any detail, ``None`` where ``p - n <= MIN_DETAIL p``.
     """
     if not moments:
         return None

@@ -47,7 +47,7 @@ def psnr(
 
 
 def ssim_fits(height: int, width: int) -> bool:
-    """Whether an image is large enough for one SSIM window."""
+    """Whether each side of an image, in pixels, holds SSIM's window of 11."""
     return min(height, width) >= SSIM_WINDOW
 
 

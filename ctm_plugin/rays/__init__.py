@@ -1,0 +1,1 @@
+"""Cameras' rays, sampling, volume rendering, grids: functions of tensors."""

@@ -108,7 +108,7 @@ def nearest_rows(points: Tensor, low: Tensor, scale: Tensor, last: Tensor, offse
 
 @looped("samples:corners", kernel="lookup:corners")
 def corners(points: Tensor, low: Tensor, scale: Tensor, last: Tensor, offsets: Tensor) -> tuple[Tensor, Tensor]:
-    """Find the rows and weights of :class:`Corners`, of points ``[M, 3]`` and a grid's buffers."""
+    """Find the rows and weights ``[M, 8]`` of :class:`Corners`, of points ``[M, 3]`` and a grid's buffers."""
     position = _position(points, low, scale, last)
     below = torch.minimum(position.floor(), last - 1)
     x, y, z = (position - below).unbind(-1)

@@ -112,7 +112,10 @@ def load_scene(config: Config, capture: Capture | None = None) -> Any:
 
 
 def color_transform(config: Config, seed: int) -> ColorTransform:
-    """Build the fixed colour space with the learned transform on top, and its training settings as ``learning``."""
+    """Build the fixed colour space with the learned transform on top, and its training settings as ``learning``.
+
+    Raises a ConfigError for a space that learns, or under the learned one has not 3 channels.
+    """
     name = name_of(config["color_space"])
     with seeded(seed):
         space = COLOR_SPACES.get(name)(section_of(config, "color_space"))

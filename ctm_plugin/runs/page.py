@@ -184,7 +184,7 @@ def url(kind: str, content: bytes) -> str:
 
 
 def film_url(film: Path) -> str:
-    """Encode a film as a data URL, a GIF as WebP, smaller where it has too many bytes."""
+    """Encode a film as a data URL, a GIF as WebP, shrunk to at most ``MAX_FILM_BYTES``."""
     content, ending = film.read_bytes(), ".mp4" if film.suffix == ".mp4" else ".webp"
     if film.suffix != ending or len(content) > MAX_FILM_BYTES:
         frames = iio.imread(film, index=None if film.suffix == ".mp4" else ...)

@@ -125,10 +125,10 @@ def dry_run(folder: Path, settings: PhotosConfig, others: Sequence[str] = ()) ->
 
 
 def begun(folder: Path, settings: PhotosConfig, others: Sequence[str]) -> tuple[Path, Path, str]:
-    """Find a capture's folder and its run, and why cameras are to be searched; empty where they are not.
+    """Find a capture's folder, its run, and why cameras are to be searched, "" where they are not.
 
     Raises:
-        CTMError: there is no such folder, or no run can be written.
+        CTMError: there is no such folder, no run can be written, or ``others`` name its folder.
     """
     if moved := next((other for other in others if other.startswith("hydra.run.dir=")), None):
         raise ConfigError("hydra.run.dir", moved.partition("=")[2], f"none: it writes into {RUNS}/ where it is started")

@@ -142,7 +142,7 @@ def cameras_in_files(module: Splat, views: Views, every: int = 1) -> list[Camera
 
 
 def write_splats(path: Path, gaussians: Gaussians) -> None:
-    """Write Gaussians of three channels in harmonics up to degree 3 as 3DGS does, whole or not at all."""
+    """Write Gaussians as 3DGS's PLY, whole or not at all; they have three channels, harmonics up to degree 3."""
     shN = (gaussians.shN.cpu().unflatten(1, (-1, 3)) * HARMONIC_SIGNS[:, None]).transpose(1, 2).flatten(1)
     means, scales, quats, opacities, sh0, _ = (table.cpu() for table in gaussians)
     table = torch.cat([means, torch.zeros_like(means), sh0, shN, opacities, scales, F.normalize(quats, dim=1)], 1)

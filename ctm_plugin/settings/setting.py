@@ -69,7 +69,7 @@ def setting(default: Any, meaning: str, *, composed: str | None = None, **allowe
         composed: the default on a command line, an interpolation, where it depends on other keys.
         allowed: ``least`` and ``most`` of a number, ends that count, or ``above`` and ``below``, ends that do not;
             ``choices``, in place of numbers or besides them. ``null`` is allowed where the type has ``None``. An
-            integer has at most 31 bits.
+            integer has at most 31 bits. TypeError: another rule.
     """
     if unknown := set(allowed) - set(RULES):
         raise TypeError(f"setting() got {', '.join(sorted(unknown))}, expected some of {', '.join(RULES)}")

@@ -1,6 +1,7 @@
 """The pictures of docs/concepts.md, from runs on the still life: dark, in plain RGB, CTM and ctm=auto; lit, in CTM.
 
-``python docs/pictures/concepts.py RUNS [FOLDER]``
+``python docs/pictures/concepts.py RUNS [FOLDER]``, with the runs of ``ctm -m ctm=off,quick,auto trainer=quick
+hydra.sweep.dir=RUNS`` and ``ctm dataset.light=lit ctm=quick trainer=quick hydra.run.dir=RUNS/lit``.
 """
 
 from __future__ import annotations

@@ -107,7 +107,7 @@ class Cursor:
             raise self.fault(f"{count} {what}", f"what fits the {left} bytes that follow: the file is cut or damaged")
 
     def take(self, kinds: str, what: str) -> tuple:
-        """Read numbers of these types, in :mod:`struct`'s letters, little-endian and packed."""
+        """Read numbers of these types, in :mod:`struct`'s letters, little-endian, packed; DataError: the file ends."""
         form = struct.Struct(f"<{kinds}")
         self.need(1, form.size, what)
         self.at += form.size
@@ -120,7 +120,7 @@ class Cursor:
         return count
 
     def text(self, what: str) -> str:
-        """Read a text that ends in a zero byte."""
+        """Read a text that ends in a zero byte, else raise a DataError that asks for ``what``."""
         end = self.data.find(b"\0", self.at)
         try:
             text = self.data[self.at : end].decode() if end >= 0 else ""
@@ -137,6 +137,9 @@ def as_binary(path: Path) -> tuple[bytes, list[tuple[int, int]]]:
 
     Returns:
         The bytes, and for each record its offset in them and its line in the text.
+
+    Raises:
+        DataError: a line has other fields; the message shows it.
     """
     pack, expected = TEXT_LAYOUTS[path.stem]
     content = read_bytes(path, "a file of COLMAP's text model")
@@ -215,7 +218,10 @@ def read_cameras(path: Path) -> dict[int, Intrinsics | DataError]:
 
 
 def parameters(cursor: Cursor, name: str, values: tuple[float, ...]) -> tuple:
-    """Turn a camera model's parameters into fx, fy, cx, cy and the distortion (k1, k2, p1, p2, k3)."""
+    """Turn a camera model's parameters into fx, fy, cx, cy and the distortion (k1, k2, p1, p2, k3).
+
+    Raises a DataError for a focal length that is not > 0, infinities, and k4 to k6.
+    """
     if not all(-1e9 < value < 1e9 for value in values):
         raise cursor.fault(f"camera parameters {values}", "finite numbers")
     single = name.startswith("SIMPLE") or name == "RADIAL"
@@ -262,7 +268,10 @@ def usable(pictures: Sequence[Taken | DataError]) -> list[Taken]:
 
 
 def camera_to_world(cursor: Cursor, number: int, pose: Float64[np.ndarray, " 7"]) -> Float64[np.ndarray, "3 4"]:
-    """OpenGL's camera to world out of COLMAP's world to camera (y down, z forward): a quaternion and a translation."""
+    """OpenGL's camera to world out of COLMAP's world to camera (y down, z forward): a quaternion and a translation.
+
+    Raises a DataError for a pose that is no camera's.
+    """
     small = np.abs(pose).max() <= MAX_COORDINATE  # false for NaN
     length = np.linalg.norm(pose[:4]) if small else 0.0
     if not 0.9 < length < 1.1:

@@ -58,7 +58,7 @@ def opened_file(path: Path) -> Iterator[Any]:
 
 
 def numbers(file: Any) -> np.ndarray:
-    """Read a file's first picture ``[H, W, C]``, in its stored number type."""
+    """Read a file's first picture ``[H, W, C]``, in its stored number type; OSError: it is damaged."""
     spec = file.spec()
     found = file.read_image(0, 0, 0, spec.nchannels, spec.format)
     if found is None:
@@ -72,7 +72,7 @@ def colored(pixels: np.ndarray) -> np.ndarray:
 
 
 def write_tiff(path: Path, codes: UInt16[np.ndarray, "h w 3"], orientation: int, lens: Lens) -> None:
-    """Write sRGB of 16 bits, with EXIF's orientation and lens."""
+    """Write sRGB of 16 bits, with EXIF's orientation and lens; OSError: it cannot be written."""
     import OpenImageIO as oiio
 
     spec = oiio.ImageSpec(codes.shape[1], codes.shape[0], 3, "uint16")
@@ -87,7 +87,10 @@ def write_tiff(path: Path, codes: UInt16[np.ndarray, "h w 3"], orientation: int,
 
 @contextmanager
 def open_deep(path: Path) -> Iterator[Opened]:
-    """Open a TIFF or an EXR. 16 bits, and 8 without an ICC profile, are taken for sRGB, floats for linear light."""
+    """Open a TIFF or an EXR. 16 bits, and 8 without an ICC profile, are taken for sRGB, floats for linear light.
+
+    Raises a DataError for channels other than grey or RGB with alpha, and for a cropped EXR.
+    """
     require_file(path, EXPECTED)
     with told(path, "a picture that cannot be read", EXPECTED), opened_file(path) as file:
         spec = file.spec()

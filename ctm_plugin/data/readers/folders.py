@@ -108,7 +108,7 @@ def plain_name(name: str, root: Path | None = None) -> str:
 def inside(root: Path, name: str, source: Path | None = None) -> Path:
     """Find ``root / name``, which stays inside ``root``: ``..`` is resolved in the name itself, links are followed.
 
-    Links that the folder's owner made may lead out of it; names written in a file, ``source``, may not.
+    Links that the folder's owner made may lead out of it; a name in the file ``source`` that does is a DataError.
     """
     source = source or root / name
     expected = "a path inside the data set's folder, relative to it"

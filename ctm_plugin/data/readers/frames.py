@@ -118,7 +118,8 @@ def read_pose(frame: Record) -> np.ndarray:
 def read_camera(record: Record, frame: Record, width: int, height: int, remarks: dict[str, str]) -> Intrinsics:
     """Read a frame's intrinsics: each number from the frame, else from the file, else from the picture.
 
-    ``remarks`` collects warnings about the cameras, one for each key.
+    ``remarks`` collects warnings about the cameras, one for each key. DataError: no focal length, a lens that is
+    no pinhole with distortion, or numbers of another picture.
     """
 
     def given(key: str) -> Record | None:

@@ -49,7 +49,7 @@ warnings.filterwarnings("ignore", category=Image.DecompressionBombWarning)  # th
 
 @contextmanager
 def opened(path: Path) -> Iterator[Image.Image]:
-    """Context with Pillow's picture of a file, not yet decoded."""
+    """Context with Pillow's picture of a file, not yet decoded; DataError: it is no ``PILLOW_FORMATS`` or HEIC."""
     expected = f"a whole image ({', '.join(PILLOW_FORMATS)}, HEIC) of at most {MAX_PIXELS} pixels"
     require_file(path, expected)
     with told(path, "an image that cannot be read", f"{expected}: copy it here again, or leave it out"):
@@ -70,7 +70,10 @@ def opened(path: Path) -> Iterator[Image.Image]:
 
 
 def heif_formats() -> tuple[str, ...]:
-    """Register pillow-heif with Pillow, and name the formats that it opens: HEIC and others, upright."""
+    """Register pillow-heif with Pillow, and name the formats that it opens: HEIC and others, upright.
+
+    Raises a CTMError that names the extra where it is not installed.
+    """
     try:
         from pillow_heif import register_heif_opener
     except ImportError as error:
@@ -185,7 +188,9 @@ def read_image(path: Path) -> Float32[Tensor, "h w c"]:
 
 
 def read_depth(path: Path, scale: float) -> Float32[Tensor, "h w"]:
-    """Read depth ``[H, W]``, times ``scale``, NaN where nothing was hit: 16-bit grey, 0 for nothing, or a ``.npy``."""
+    """Read depth ``[H, W]``, times ``scale``, NaN where nothing was hit: 16-bit grey, 0 for nothing, or a ``.npy``.
+
+    Raises a DataError for other kinds and shapes, and for distances <= 0 or infinite."""
     if path.suffix != ".npy":
         with opened(path) as image:
             if not image.mode.startswith("I"):
@@ -203,7 +208,10 @@ def read_depth(path: Path, scale: float) -> Float32[Tensor, "h w"]:
 
 
 def map_numbers(path: Path, expected: str) -> np.ndarray:
-    """Memory-map an array ``[...]`` of floats in a ``.npy``: the file's length bounds what its header may claim."""
+    """Memory-map an array ``[...]`` of floats in a ``.npy``, else raise a DataError.
+
+    The file's length bounds what its header may claim.
+    """
     require_file(path, expected)
     with told(path, "no array that can be read", expected):
         array = np.lib.format.open_memmap(path, mode="r")

@@ -27,6 +27,7 @@ def read_key_frames(path: Path) -> KeyFrames:
 
     ``camera_to_world`` has OpenGL axes, ``fov`` is vertical; ``closed`` may be left out. So may the light in which the
     path was made: ``light`` in stops, ``contrast`` and ``saturation``, all three of them or none.
+    DataError: anything else.
     """
     whole = parse_record(read_bytes(path, "a file of key frames"), path)
     closed = "closed" in whole and whole.checked("closed", lambda value: isinstance(value, bool), PATH_EXPECTED)

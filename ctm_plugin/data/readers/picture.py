@@ -138,7 +138,7 @@ def unpremultiplied(pixels: Float32[np.ndarray, "h w 4"]) -> Float32[np.ndarray,
 
 
 def from_light(light: Float[np.ndarray, "h w c"], path: Path) -> Float32[Tensor, "h w c"]:
-    """Encode linear light as sRGB, alpha unchanged; values outside [0, 1] stay outside."""
+    """Encode linear light as sRGB, alpha unchanged; values outside [0, 1] stay outside. DataError: NaN or infinity."""
     if not np.isfinite(light).all():
         raise DataError(path, "NaN or infinity", "finite numbers")
     image = torch.from_numpy(np.ascontiguousarray(light, dtype=np.float32))

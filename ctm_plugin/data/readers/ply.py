@@ -23,7 +23,10 @@ PLY_EXPECTED = (
 
 
 def read_ply(path: Path) -> Float64[np.ndarray, "p 3"]:
-    """Read the positions ``[P, 3]`` of the vertices, none that are NaN or absurdly far away."""
+    """Read the positions ``[P, 3]`` of the vertices, none that are NaN or beyond ``MAX_COORDINATE``.
+
+    Raises a DataError for what is not ``PLY_EXPECTED``.
+    """
     head, _, body = read_bytes(path, PLY_EXPECTED).partition(b"end_header")
     lines = [line.split() for line in head.decode("ascii", "replace").splitlines()]
     elements = [number for number, line in enumerate(lines) if line[:1] == ["element"]]

@@ -71,7 +71,7 @@ def open_raw(
 
 
 def require_rawpy() -> ModuleType:
-    """Import rawpy, LibRaw's module, or name the extra that is missing."""
+    """Import rawpy, LibRaw's module, else raise a CTMError that names the extra."""
     try:
         import rawpy
     except ImportError as error:
@@ -98,7 +98,7 @@ class RawHeader(NamedTuple):
 
 
 def read_raw(path: Path) -> RawHeader:
-    """Read a raw picture's metadata, without developing it."""
+    """Read a raw picture's metadata, without developing it; DataError: LibRaw cannot read it."""
     rawpy = require_rawpy()
     expected = "a raw picture that LibRaw can develop: copy it here again, or leave it out"
     require_file(path, expected)

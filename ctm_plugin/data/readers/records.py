@@ -44,7 +44,7 @@ class Record:
         return DataError(self.source, f"{self.place(key)} = {reprlib.repr(self.values[key])}", expected)
 
     def checked(self, key: str, allowed: Callable[[Any], bool], expected: str) -> Any:
-        """Read the value under ``key``, for which ``allowed`` has to hold; ``None`` where there is none."""
+        """Read the value under ``key``; ``None`` where there is none; DataError where ``allowed`` does not hold."""
         value = self.values.get(key)
         if not allowed(value):
             raise self.fault(key, expected)
@@ -65,7 +65,7 @@ class Record:
         )
 
     def records(self, key: str, expected: str) -> list[Record]:
-        """Read a list of at least one JSON object."""
+        """Read a list of at least one JSON object, else raise a DataError."""
         values = self.checked(key, lambda value: isinstance(value, list) and len(value) > 0, expected)
         places = [f"{self.place(key)}[{index}]" for index in range(len(values))]
         for place, value in zip(places, values, strict=True):
@@ -74,7 +74,7 @@ class Record:
         return [Record(value, self.source, place) for place, value in zip(places, values, strict=True)]
 
     def matrix(self, key: str, rows: int, columns: int, limit: float) -> Float64[np.ndarray, "rows columns"]:
-        """Read a matrix, ``rows`` lists of ``columns`` numbers, each below ``limit`` in size."""
+        """Read a matrix, ``rows`` lists of ``columns`` numbers, each below ``limit`` in size, else a DataError."""
         expected = f"{rows} rows of {columns} finite numbers below {limit:g}"
 
         def shaped(value: Any) -> bool:
@@ -89,7 +89,7 @@ class Record:
 
 
 def parse_record(content: bytes, source: Path) -> Record:
-    """Parse a file's JSON object, or the only object of a list, as exiftool writes it."""
+    """Parse a file's JSON object, or the only object of a list, as exiftool writes it; else a DataError."""
     with told(source, "something that is not JSON", "a JSON file"):
         values = json.loads(content)
     values = values[0] if isinstance(values, list) and len(values) == 1 else values
