@@ -117,7 +117,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
         with _a_line_each():
             _run(arguments)
     except (KeyboardInterrupt, Interrupted) as stop:
-        return _stopped(stop)
+        from ctm_plugin.runs.processes import is_main_process
+
+        if is_main_process():  # of several, one tells it
+            print(str(stop) or "stopped", file=sys.stderr)
+        cause = stop if isinstance(stop, Interrupted) else stop.__cause__
+        return REQUEUE_CODE if isinstance(cause, Interrupted) and cause.by == signal.SIGTERM else 130
     except USER_ERRORS as error:
         print(f"error: {explain(error)}", file=sys.stderr)
         return 2 if isinstance(error, commands.UsageError) else 1
@@ -201,7 +206,12 @@ def _train(arguments: Sequence[str]) -> None:
     ready, parser = prepared(arguments), get_args_parser()
     parser.prog = "ctm"
     flags = parser.parse_intermixed_args(ready)
-    name, overrides = flags.config_name or "config", [*flags.overrides, *_searched(flags.config_dir)]
+    name, overrides = flags.config_name or "config", [*flags.overrides]
+    if (folder := flags.config_dir) is not None:
+        if not os.path.isdir(folder):
+            raise ConfigError("--config-dir", folder, "a folder with choices")
+        url = QuotedString(f"file://{os.path.abspath(folder)}", Quote.single).with_quotes()
+        overrides.append(f"hydra.searchpath=[{url}]")
     with at_work(flags.config_path):
         own = GlobalHydra.instance().hydra
         if flags.hydra_help:
@@ -219,15 +229,6 @@ def _train(arguments: Sequence[str]) -> None:
                 _print_one(own, config, flags)
             else:
                 _run_one(own, config, name)
-
-
-def _searched(folder: str | None) -> list[str]:
-    """The override that makes Hydra search ``folder`` for choices too; empty without one."""
-    if folder is None:
-        return []
-    if not os.path.isdir(folder):
-        raise ConfigError("--config-dir", folder, "a folder with choices")
-    return [f"hydra.searchpath=[{QuotedString(f'file://{os.path.abspath(folder)}', Quote.single).with_quotes()}]"]
 
 
 def _print_one(own: Hydra, config: DictConfig, flags: Namespace) -> None:
@@ -262,15 +263,6 @@ def _run_one(own: Hydra, config: DictConfig, name: str) -> None:
     callbacks.on_run_end(config=config, config_name=name, job_return=done)
     if failed:
         raise failed[0]
-
-
-def _stopped(stop: BaseException) -> int:
-    from ctm_plugin.runs.processes import is_main_process
-
-    if is_main_process():  # of several, one tells it
-        print(str(stop) or "stopped", file=sys.stderr)
-    cause = stop if isinstance(stop, Interrupted) else stop.__cause__
-    return REQUEUE_CODE if isinstance(cause, Interrupted) and cause.by == signal.SIGTERM else 130
 
 
 def _is_resume(argument: str) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -13,7 +14,6 @@ from torch.optim import Optimizer
 from ctm_plugin.color.photometric import Photometric
 from ctm_plugin.color.prepare import adam_of, prepare
 from ctm_plugin.color.transform import ColorTransform
-from ctm_plugin.draws import Draws
 from ctm_plugin.errors import ConfigError, CTMError
 from ctm_plugin.runs.assemble import color_transform
 from ctm_plugin.runs.compose import compose, conf_dir, explain
@@ -73,11 +73,7 @@ def fit(
     if transform.learning.lr_decay != 1:
         raise ConfigError("ctm.lr_decay", transform.learning.lr_decay, "1: your training schedules the optimizer")
     optimizer = optimizer or adam_of(transform)
-
-    def drawn(draws: Draws, count: int) -> Tensor:
-        return colors[draws.integers(len(colors), count)]
-
-    prepare(transform, optimizer, drawn, seed, colors.device)
+    prepare(transform, optimizer, lambda draws, count: colors[draws.integers(len(colors), count)], seed, colors.device)
     return optimizer
 
 
@@ -99,12 +95,8 @@ def losses(
     Returns:
         Terms by name, ``[]`` each. A training minimises their sum.
     """
-
-    def uniform(rows: int, channels: int) -> Tensor:
-        return torch.rand(rows, channels, device=rgb.device)
-
     with torch.autocast(rgb.device.type, enabled=False):
-        photometric = Photometric(kind=kind, weight=weight)
+        photometric, uniform = Photometric(kind=kind, weight=weight), partial(torch.rand, device=rgb.device)
         return transform.losses([latent.float()], rgb.float(), photometric, uniform).terms
 
 

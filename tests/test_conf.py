@@ -222,16 +222,14 @@ PAPER = {
 """Data set and backgrounds of each set of the paper."""
 
 
-@pytest.mark.parametrize("ctm", ["on", "off"])
 @pytest.mark.parametrize("backbone", ["nerf", "dvgo"])
 @pytest.mark.parametrize("data", PAPER)
-def test_experiments_of_the_paper(composed, data, backbone, ctm):
-    arguments = ["dataset.root=x", *([] if ctm == "on" else ["ctm=off"])]
-    config = composed(f"+experiment={data}_{backbone}", *arguments)
+def test_experiments_of_the_paper(composed, data, backbone):
+    config = composed(f"+experiment={data}_{backbone}", "dataset.root=x")
     builds(config)
     layout, backgrounds = PAPER[data]
     assert (config["dataset"]["name"], config["dataset"]["background"]) == (layout, backgrounds[backbone])
-    assert (config["ctm"]["preset"], config["trainer"]["budget"]) == (ctm, "paper")
+    assert (config["ctm"]["preset"], config["trainer"]["budget"]) == ("on", "paper")
     forward = layout != "blender"
     assert config["dataset"]["geometry"] == config["backbone"]["geometry"] == ("forward" if forward else "bounded")
     if forward:

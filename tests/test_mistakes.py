@@ -170,7 +170,8 @@ def test_typos_and_help_are_told_before_torch_is_imported(tmp_path):
         "demo backbone.lr_gird=1": "backbone.lr_grid",
     }
     code = "import sys; from ctm_plugin.cli import main\n"
-    code += f"for line in [*{list(lines)}, '--help']: main(line.split())\nprint('torch' in sys.modules)"
+    others = ["--help", "export --help", "list", "list backbone=dvgo"]
+    code += f"for line in {[*lines, *others]}: main(line.split())\nprint('torch' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, timeout=60)
     assert [line.partition("did you mean ")[2] for line in done.stderr.splitlines()] == [
         f"{m}?" for m in lines.values()

@@ -25,8 +25,7 @@ from ctm_plugin.metrics.precision import full_float32
 from ctm_plugin.metrics.rendered import Alignment
 from ctm_plugin.rays.homography import pixel_grid, sl3_exp, warp
 from ctm_plugin.scene.views import PlanarScene
-from ctm_plugin.show.outlines import outlines
-from ctm_plugin.show.pictures import below, beside, latent_picture, write_png
+from ctm_plugin.show.pictures import below, beside, latent_picture, outlines, write_png
 from ctm_plugin.show.snapshot import Snapshot, compared
 
 TRANSLATION = 2

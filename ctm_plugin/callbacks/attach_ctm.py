@@ -11,7 +11,6 @@ from torch.optim import Optimizer
 
 from ctm_plugin.color.prepare import adam_of, prepare
 from ctm_plugin.color.transform import ColorTransform
-from ctm_plugin.draws import Draws
 from ctm_plugin.errors import CTMError
 from ctm_plugin.optim.named_optimizers import NamedOptimizers, leave_out
 from ctm_plugin.optim.schedules import exponential
@@ -49,9 +48,11 @@ class AttachTransform(L.Callback):
 
     def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         if trainer.global_step == 0:  # else a checkpoint has what was found
-            colors = self.colors.to(pl_module.device)
-            members = getattr(trainer.optimizers[0], "members", {})
-            prepare(self.transform, members.get("ctm"), lambda *drawn: _of(colors, *drawn), self.seed, colors.device)
+            colors, adam = self.colors.to(pl_module.device), getattr(trainer.optimizers[0], "members", {}).get("ctm")
+            prepare(
+                self.transform, adam, lambda draws, count: colors[draws.integers(len(colors), count)], self.seed,
+                colors.device,
+            )  # fmt: skip
 
     def on_train_batch_start(self, trainer: L.Trainer, *_: Any) -> None:
         if isinstance(both := trainer.optimizers[0], NamedOptimizers):
@@ -59,7 +60,3 @@ class AttachTransform(L.Callback):
 
     def teardown(self, trainer: L.Trainer, pl_module: L.LightningModule, stage: str) -> None:
         vars(pl_module).pop("configure_optimizers", None)
-
-
-def _of(colors: Tensor, draws: Draws, count: int) -> Tensor:
-    return colors[draws.integers(len(colors), count)]

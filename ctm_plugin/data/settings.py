@@ -46,11 +46,6 @@ class DimConfig(Settings, section="dataset"):
     exposure: Number = setting(1.0, "factor on the linear light of the pictures; 1: as photographed", above=0, most=1)
     noise: NoiseConfig = setting(NoiseConfig(), "noise of a sensor, added to training views (or patches)")
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if not isinstance(self.noise, NoiseConfig):
-            raise self.fault("noise", "read, shot and seed")
-
 
 @dataclass(frozen=True, kw_only=True)
 class PhotoConfig(DimConfig):

@@ -111,7 +111,7 @@ class WandB(RunLogger, WandbLogger):
             id=kept_id(self.kept) or secrets.token_hex(4),
             project=config.project,
             mode=config.mode,
-            group=config.group or sweep_of(run),
+            group=config.group or (run.parent.name if (run.parent / "multirun.yaml").is_file() else None),
         )
 
     def open(self) -> None:
@@ -119,7 +119,8 @@ class WandB(RunLogger, WandbLogger):
 
     def log_pictures(self, pictures: Mapping[str, Tensor], step: int) -> None:
         for name, picture in pictures.items():
-            self.log_image(name, [image(picture)], step)
+            # W&B would guess how an array is scaled.
+            self.log_image(name, [Image.fromarray(to_8_bits(picture.float()).numpy())], step)
 
     def log_histograms(self, values: Mapping[str, Tensor], step: int) -> None:
         from wandb import Histogram
@@ -129,11 +130,6 @@ class WandB(RunLogger, WandbLogger):
 
     def close(self) -> None:
         self.experiment.finish()  # or the next run of a sweep would go on with it
-
-
-def sweep_of(run: Path) -> str | None:
-    """Name the sweep that a run belongs to, by its folder; ``None`` for a single run."""
-    return run.parent.name if (run.parent / "multirun.yaml").is_file() else None
 
 
 def kept_id(file: Path) -> str | None:
@@ -146,8 +142,3 @@ def kept_id(file: Path) -> str | None:
     if found is not None and not re.fullmatch(r"[A-Za-z0-9_-]{1,64}", found):
         raise CheckpointError(file, repr(found), "a run's id")
     return found
-
-
-def image(picture: Tensor) -> Image.Image:
-    """Turn ``[H, W, 3]`` in [0, 1] into a picture for services that would guess how an array is scaled."""
-    return Image.fromarray(to_8_bits(picture.float()).numpy())

@@ -137,8 +137,5 @@ def csv_text(tables: Sequence[Table]) -> str:
     return out.getvalue()
 
 
-FORMATS = {
-    "md": lambda tables: "\n".join(map(markdown, tables)),
-    "csv": csv_text,
-}
+FORMATS = {"md": lambda tables: "\n".join(map(markdown, tables)), "csv": csv_text}
 """Functions that write tables as text, by format."""

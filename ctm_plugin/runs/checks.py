@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import fields
-from typing import Any, NamedTuple, TypeVar
+from types import SimpleNamespace
+from typing import Any, TypeVar
 
 from ctm_plugin.errors import ConfigError
 from ctm_plugin.settings.build import SECTIONS, Config, build, unknown_key
@@ -14,24 +15,8 @@ from ctm_plugin.settings.setting import MAX_INT, Nothing
 T = TypeVar("T")
 
 
-class Checked(NamedTuple):
-    """A configuration's sections as checked dataclasses; ``training``: settings that all choices of ``ctm`` share."""
-
-    dataset: Any
-    backbone: Any
-    ctm: Any
-    training: Any
-    color_space: Any
-    appearance: Any
-    loss: Any
-    trainer: Any
-    metrics: Any
-    logger: Any
-    callbacks: dict[str, Any]
-
-
-def checked(config: Config, watched: bool = True) -> Checked:
-    """Build the settings of all sections.
+def checked(config: Config, watched: bool = True) -> SimpleNamespace:
+    """Build the settings of all sections: checked dataclasses by the sections' names.
 
     Args:
         config: the resolved configuration.
@@ -57,13 +42,13 @@ def checked(config: Config, watched: bool = True) -> Checked:
     for name, node in named.items():
         if not isinstance(node, Mapping):
             raise ConfigError(f"callbacks.{name}", node, "settings, or null for none of it")
-    one = [section for section in SECTIONS if section not in ("callbacks", "ctm", *(() if watched else ("logger",)))]
-    parts = {"logger": None} | {section: section_of(config, section) for section in one}
-    training, ctm = transform_of(config)
+    left_out = ("callbacks", "ctm", *(() if watched else ("logger",)))
+    parts = {section: section_of(config, section) for section in SECTIONS if section not in left_out}
+    transform_of(config)
     callbacks = {
         name: build(CALLBACKS.settings(name), node, f"callbacks.{name}") for name, node in named.items() if watched
     }
-    return Checked(**parts, training=training, ctm=ctm, callbacks=callbacks)
+    return SimpleNamespace(**parts, callbacks=callbacks)
 
 
 def section_of(config: Config, section: str) -> Any:

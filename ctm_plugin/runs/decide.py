@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
 from contextlib import suppress
 from importlib.util import find_spec
 from typing import Any
@@ -38,7 +37,8 @@ def decide(config: DictConfig) -> Capture | None:
     dataset, decided = OmegaConf.to_container(config.dataset, resolve=True, throw_on_missing=False), {}
     capture, rig = _read(dataset) if AUTO in (dataset.get("geometry"), config.trainer.budget) else (None, None)
     if dataset.get("geometry") == AUTO:
-        decided["dataset.geometry"] = ("bounded", "") if rig is None else rig.geometry(_among(config.backbone.name))
+        among = getattr(BACKBONES.get(str(config.backbone.name)), "geometries", GEOMETRIES) if rig else GEOMETRIES
+        decided["dataset.geometry"] = rig.geometry(among) if rig else ("bounded", "")
     accelerator = config.trainer.accelerator
     if accelerator == AUTO and config.backbone.name == "splat" and has_gpu() and not composites_there():
         accelerator = "cpu"
@@ -83,9 +83,3 @@ def _read(dataset: dict[str, Any]) -> tuple[Capture | None, Rig | None]:
             capture = layout.capture()
             rig = layout.rig(capture)
     return capture, rig
-
-
-def _among(backbone: Any) -> Sequence[str]:
-    with suppress(CTMError):
-        return getattr(BACKBONES.get(str(backbone)), "geometries", GEOMETRIES)
-    return GEOMETRIES

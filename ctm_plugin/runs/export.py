@@ -58,7 +58,8 @@ def export(run: Path, settings: ExportConfig) -> None:
         place = (Path(settings.out) if settings.out else run) / PAGE
         if not settings.overwrite:
             check_new([place])
-        export_page(run, load_posed(run, settings.dataset.root, pictures=False), place, settings)
+        posed = load_posed(run, settings.dataset.root, pictures=False)
+        write_page(place, run, posed, chosen_light(settings, posed.light))
         print_file("written to ", place)
         return
     posed = load_posed(run, settings.dataset.root, pictures=settings.photographs)
@@ -87,11 +88,6 @@ def export(run: Path, settings: ExportConfig) -> None:
         print(f"next: ns-train splatfacto --data {shlex.quote(str(place))}")
     else:
         print_next("view", run)
-
-
-def export_page(run: Path, posed: LoadedRun, path: Path, settings: ExportConfig) -> None:
-    """Write a run's HTML page to ``path``."""
-    write_page(path, run, posed, chosen_light(settings, posed.light))
 
 
 def write_views(run: Path, posed: LoadedRun) -> None:

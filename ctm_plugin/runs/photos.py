@@ -19,7 +19,7 @@ from ctm_plugin.errors import CheckpointError, ConfigError, DataError
 from ctm_plugin.runs.compose import compose
 from ctm_plugin.runs.decide import composites_there, has_gpu
 from ctm_plugin.runs.rundir import ALL, CONFIG, METRICS, PAGE, film_of, load_config
-from ctm_plugin.runs.settings import ExportConfig, PhotosConfig, VideoConfig
+from ctm_plugin.runs.settings import PhotosConfig, VideoConfig
 from ctm_plugin.settings.build import build
 from ctm_plugin.settings.registry import DATASETS
 from ctm_plugin.show.bars import whole
@@ -59,8 +59,9 @@ def photos(folder: Path, settings: PhotosConfig, others: Sequence[str] = ()) -> 
             read_picture(path)
     # These take seconds to import: what lies in the folder is refused before.
     from ctm_plugin.cameras.command import place, tell
-    from ctm_plugin.runs.export import export_page, write_views
+    from ctm_plugin.runs.export import write_views
     from ctm_plugin.runs.load import load_posed
+    from ctm_plugin.runs.page import write_page
     from ctm_plugin.runs.train import resume, train
     from ctm_plugin.runs.video import film
     from ctm_plugin.show.console import output_console, print_file, print_next
@@ -89,7 +90,7 @@ def photos(folder: Path, settings: PhotosConfig, others: Sequence[str] = ()) -> 
             if not (run / ALL).exists():
                 write_views(run, posed)
             if not (run / PAGE).exists():
-                export_page(run, posed, run / PAGE, ExportConfig(what="page"))
+                write_page(run / PAGE, run, posed, posed.light)
     say(f"lit views: {run / ALL}\nfilm:      {film_of(run)}\nscores:    {run / METRICS}")
     print_file("all of it: ", run / PAGE)
     print_next("view", run)

@@ -182,3 +182,40 @@ class PhotosConfig(Settings):
         above=0,
     )
     again: bool = setting(False, "train again, in a new folder, although there is a finished run of this folder")
+
+
+@dataclass(frozen=True, kw_only=True)
+class MetricsConfig(Settings, section="metrics"):
+    """Scores of test views."""
+
+    lpips_weights: str | Path | None = setting(
+        None, "file (.npz or .pth) with AlexNet's or VGG's convolutions; null: torch.hub's cache, else a download"
+    )
+    lpips_net: str = setting("alex", "network that LPIPS compares with: alex or vgg", choices=("alex", "vgg"))
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReportConfig(Settings):
+    """Settings of ``ctm report``: metrics, tables and formats."""
+
+    table: int | None = setting(
+        None, "number of the paper's table to show, 1 to 19; null: all runs, and the paper's tables that they fill"
+    )
+    data: str | None = setting(
+        None,
+        "name of the paper's data set whose values are shown next to runs of other data, such as Synthetic-NeRF-Dark",
+    )
+    format: str = setting("md", "format of tables: md, csv or html", choices=("md", "csv", "html"))
+    out: str | None = setting(None, "file to write; null: standard output, report.html for html")
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.out is not None and not Path(self.out).name:
+            raise self.fault("out", "the name of a file")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ViewConfig(LitConfig):
+    """Port and first light of the viewer."""
+
+    port: int = setting(8080, "port of the page", least=1, most=65535)

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import itertools
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 from ctm_plugin.data.capture import Capture
 from ctm_plugin.errors import CheckpointError
-from ctm_plugin.runs.rundir import CONFIG, ERROR, METRICS, load_config, read_json
+from ctm_plugin.runs.rundir import CONFIG, ERROR, METRICS, load_config, new_folder, read_json
 from ctm_plugin.runs.train import resume, train
 from ctm_plugin.settings.build import Config
 from ctm_plugin.show.console import print_line
@@ -40,8 +39,7 @@ def go_on(config: Config, sweep: Path, folder: Path, capture: Capture | None = N
             return metrics
         (run / ERROR).unlink(missing_ok=True)
         return resume(run, print_line)
-    names = itertools.chain([folder], (folder.with_name(f"{folder.name}_{n}") for n in itertools.count(2)))
-    return train(config, next(each for each in names if not (each / CONFIG).exists()), print_line, capture)
+    return train(config, new_folder(folder), print_line, capture)
 
 
 def finished(sweep: Path) -> list[tuple[Config, dict[str, Any]]]:

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import MISSING, fields, is_dataclass
 from difflib import get_close_matches
 from pathlib import Path
-from types import UnionType
+from types import NoneType, UnionType
 from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 
-from omegaconf import DictConfig, ListConfig, OmegaConf
-from omegaconf.errors import ConfigKeyError, MissingMandatoryValue, OmegaConfBaseException, ValidationError
+from omegaconf import BooleanNode, FloatNode, IntegerNode, OmegaConf, StringNode
+from omegaconf.errors import ValidationError
 
 from ctm_plugin.errors import ConfigError, CTMError, Words
 from ctm_plugin.settings.setting import meanings
@@ -25,6 +26,8 @@ NO_WORDS, YES_WORDS = ("none", "off", "no", "null", "false", "0"), ("on", "yes",
 """Words that switch a group off, and words that stand for its plain choice."""
 TYPES = {int: "an integer", float: "a number", bool: "true or false", str: "text", type(None): "null"}
 TYPES |= {tuple: "a list", list: "a list", dict: "a mapping"}
+NODES = {int: IntegerNode, float: FloatNode, bool: BooleanNode, str: StringNode}
+"""OmegaConf's checks and conversions of values by type."""
 T = TypeVar("T")
 Node = Any
 """Type of a configuration's ``DictConfig``, as ``Any`` because beartype warns of that class."""
@@ -70,24 +73,19 @@ def build(settings: type[T], node: Mapping[str, Any], key: str, also: Iterable[s
     Raises:
         ConfigError: on an unknown key (with the known ones), a missing one, or a value of another type.
     """
-    schema = _schema(settings)
-    _check_groups(schema, node, key)
+    hints, own = get_type_hints(settings), {each.name: each for each in fields(settings)}
+    if unknown := next((name for name in node if name not in own), None):
+        raise unknown_key(_below(key, unknown), [*own, *also])
     try:
-        return _instance(OmegaConf.merge(schema, dict(node)), key)
+        given = {name: value for name, value in node.items() if value != "???"}
+        values = {name: _value(value, hints[name], _below(key, name)) for name, value in given.items()}
     except RecursionError as error:
         raise ConfigError(key, Words("lists or mappings nested too deeply"), "plain values") from error
-    except ConfigKeyError as error:
-        there = [*_known(settings, error.full_key), *(() if "." in error.full_key else also)]
-        raise unknown_key(_below(key, error.full_key), there) from error
-    except MissingMandatoryValue as error:
-        parts = filter(None, ("a value", meanings(settings).get(error.full_key)))
-        raise ConfigError(_below(key, error.full_key), Words("nothing"), ": ".join(parts)) from error
-    except OmegaConfBaseException as error:
-        # An interpolation's message; its other lines repeat the key and name our classes.
-        why = str(error.msg).splitlines()[0]
-        of_type = isinstance(error, ValidationError)
-        expected = _type_of(settings, error.full_key) if of_type else f"a value that can be found: {why}"
-        raise ConfigError(_below(key, error.full_key), error.value, expected) from error
+    for name, each in own.items():
+        if name not in values and each.default is each.default_factory is MISSING:
+            parts = filter(None, ("a value", meanings(settings).get(name)))
+            raise ConfigError(_below(key, name), Words("nothing"), ": ".join(parts))
+    return settings(**values)
 
 
 def pairs(arguments: Iterable[str]) -> dict[str, str]:
@@ -144,76 +142,22 @@ def _below(key: str, name: str) -> str:
     return f"{key}.{name}" if key else name
 
 
-def _type_of(settings: type, full_key: str) -> str:
-    """Describe the type that a dotted key, or an item ``[i]`` of its list, may hold."""
-    hint: Any = settings
-    for part in full_key.split("."):
-        name, *item = part.split("[")
-        hint = get_type_hints(hint)[name]
-        hint = get_args(hint)[0] if item else hint
-    kinds = get_args(hint) if isinstance(hint, UnionType) else (hint,)
-    kinds = [kind for kind in kinds if kind is not int or float not in kinds]
-    return " or ".join(dict.fromkeys(TYPES.get(get_origin(kind) or kind, "text") for kind in kinds))
-
-
-def _known(settings: type, full_key: str) -> list[str]:
-    node = OmegaConf.structured(settings)
-    for part in full_key.split(".")[:-1]:
-        node = node[part]
-    return [str(name) for name in node]
-
-
-@functools.cache
-def _schema(settings: type) -> Node:
-    """A dataclass as OmegaConf's structured node, with types and defaults; copy it before merging."""
-    schema = OmegaConf.structured(settings)
-    _make_writable(schema)
-    return schema
-
-
-def _make_writable(node: Node) -> None:
-    """Make a node of frozen dataclasses writable, at all levels, so that values can be merged into it."""
-    OmegaConf.set_readonly(node, False)
-    for child in _groups(node).values():
-        _make_writable(child)
-
-
-def _check_groups(schema: Node, node: Mapping[str, Any], key: str) -> None:
-    """Refuse a single value in a dataclass's place, or a mapping in a list's; OmegaConf would not name the key."""
-    for name in schema:
-        if isinstance(schema._get_node(name), ListConfig) and isinstance(node.get(name), Mapping):
-            raise ConfigError(_below(key, name), node[name], "a list")
-    for name, child in _groups(schema).items():
-        value = node.get(name, {})
+def _value(value: Any, hint: Any, key: str) -> Any:
+    """A value of a field's type: ``1`` and text of a number may stand for a float, lists become tuples."""
+    if is_dataclass(hint):
         if isinstance(value, Mapping):
-            _check_groups(child, value, _below(key, name))
-        else:
-            raise ConfigError(_below(key, name), value, f"a mapping with {', '.join(sorted(child))}")
-
-
-def _groups(node: Node) -> dict[str, Node]:
-    children = {name: node._get_node(name) for name in node}
-    return {
-        name: child
-        for name, child in children.items()
-        if isinstance(child, DictConfig) and not child._is_none() and not child._is_missing()
-    }
-
-
-def _instance(node: Node, key: str) -> Any:
-    """Make a node's dataclass; lists become tuples, as a frozen dataclass should have.
-
-    Raises:
-        ConfigError: a list of plain values holds something else, which OmegaConf lets pass.
-    """
-    values = {}
-    for name in node:
-        value = node[name]
-        if isinstance(value, DictConfig):
-            value = _instance(value, _below(key, name))
-        elif isinstance(value, ListConfig):
-            kind, value = value._metadata.element_type, tuple(OmegaConf.to_object(value))
-            if kind in (bool, float, int, str) and any(each is None or isinstance(each, dict | list) for each in value):
-                raise ConfigError(_below(key, name), list(value), f"a list of {kind.__name__}")
-        values[name] = value
-    return OmegaConf.get_type(node)(**values)
+            return build(hint, value, key)
+        raise ConfigError(key, value, f"a mapping with {', '.join(sorted(each.name for each in fields(hint)))}")
+    kinds = get_args(hint) if isinstance(hint, UnionType) else (hint,)
+    if get_origin(hint) in (tuple, list) and isinstance(value, Sequence) and not isinstance(value, str):
+        return tuple(_value(each, get_args(hint)[0], f"{key}[{place}]") for place, each in enumerate(value))
+    if type(value) in kinds or Any in kinds or (Path in kinds and isinstance(value, Path)):
+        return value
+    single = [kind for kind in kinds if kind is not NoneType]
+    if len(single) == 1 and single[0] in NODES and not (isinstance(value, str) and "${" in value):
+        with suppress(ValidationError):
+            return NODES[single[0]](value, is_optional=False)._value()
+    kinds = [kind for kind in kinds if kind is not int or float not in kinds]
+    raise ConfigError(
+        key, value, " or ".join(dict.fromkeys(TYPES.get(get_origin(kind) or kind, "text") for kind in kinds))
+    )

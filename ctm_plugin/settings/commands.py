@@ -99,11 +99,11 @@ VERBS = {
     ),
     "view": Verb(
         "look around in runs in the browser", "RUN_DIR ...", "ctm_plugin.view.command:view",
-        "ctm_plugin.view.settings:ViewConfig",
+        "ctm_plugin.runs.settings:ViewConfig",
     ),
     "report": Verb(
         "make tables of finished runs, with the paper's values", "RUNS ...",
-        "ctm_plugin.report.command:report", "ctm_plugin.report.settings:ReportConfig",
+        "ctm_plugin.report.command:report", "ctm_plugin.runs.settings:ReportConfig",
     ),
     "list": Verb(
         "list the choices of all groups, or the keys of GROUP or GROUP=CHOICE", "[GROUP...]",
@@ -198,8 +198,11 @@ def _run(name: str, verb: Verb, arguments: Sequence[str], check: Callable[[Seque
         path, expected = " ".join(words), verb.words or "only settings"
         quoted = asked([shlex.quote(path)] if len(words) > 1 and os.path.exists(path) else [])
         raise UsageError(f"found {printable(path) or 'nothing'}, expected {expected}{quoted}\n{usage}")
-    others = [each for each in rest if verb.others and not _is_own(each.partition("=")[0], known)]
-    own = pairs(argument for argument in rest if argument not in others)
+    others, mine = [], []
+    for each in rest:
+        key = each.partition("=")[0]
+        (mine if not verb.others or key in known or near_to(key, known) else others).append(each)
+    own = pairs(mine)
     if unknown := [key for key in own if key not in known]:
         raise unknown_key(unknown[0], known)
     node = OmegaConf.create()
@@ -212,11 +215,6 @@ def _run(name: str, verb: Verb, arguments: Sequence[str], check: Callable[[Seque
     paths = _runs(words, verb) if verb.words.startswith("RUN") else map(Path, words)
     function = load(entry)
     function(*paths, **{key: given[key] for key in get_type_hints(function) if key in given})
-
-
-def _is_own(key: str, known: Sequence[str]) -> bool:
-    """Tell whether a key, perhaps mistyped, belongs to the verb and not to the run."""
-    return key in known or bool(near_to(key, known))
 
 
 def form(name: str, verb: Verb) -> str:

@@ -34,17 +34,12 @@ def choices(conf: Path, group: str) -> dict[str, str]:
     lines = {}
     for name in names(conf, group):
         path = conf / group / f"{name}.yaml"
-        line = first_comment(path) if path.is_file() else plain(REGISTRIES[group].about(name)).partition("\n")[0]
+        if path.is_file():
+            line = [*re.findall(r"^# ([^@].*)", path.read_text(encoding="utf-8"), re.M), ""][0]
+        else:
+            line = plain(REGISTRIES[group].about(name)).partition("\n")[0]
         lines[name] = line.split(". ")[0].rstrip(".")
     return lines
-
-
-def first_comment(path: Path) -> str:
-    """Read the first comment of a YAML file that is not Hydra's ``@package``."""
-    for line in path.read_text(encoding="utf-8").splitlines():
-        if line.startswith("# ") and not line.startswith("# @package"):
-            return line[2:]
-    return ""
 
 
 def print_choices(console: Console, conf: Path, groups: tuple[str, ...]) -> None:

@@ -175,11 +175,7 @@ COLOR_SPACES = Registry(
     "ctm_plugin.color_spaces",
     {path.stem: f"ctm_plugin.color.spaces.{path.stem}:Space" for path in PACKAGE.glob("color/spaces/[a-z]*.py")},
 )
-APPEARANCES = Registry(
-    "appearance",
-    "ctm_plugin.appearances",
-    {"exposure": "ctm_plugin.appearance.exposure:Exposure"},
-)
+APPEARANCES = Registry("appearance", "ctm_plugin.appearances", {"exposure": "ctm_plugin.appearance.exposure:Exposure"})
 METRICS_OF_OTHERS = Registry("metric", "ctm_plugin.metrics", {})
 LOGGERS = Registry(
     "logger",
@@ -189,10 +185,7 @@ LOGGERS = Registry(
 CALLBACKS = Registry(
     "callback",
     "ctm_plugin.callbacks",
-    {
-        "progress": "ctm_plugin.callbacks.progress:ProgressLine",
-        "dashboard": "ctm_plugin.callbacks.dashboard:Dashboard",
-    },
+    {"progress": "ctm_plugin.callbacks.progress:ProgressLine", "dashboard": "ctm_plugin.callbacks.dashboard:Dashboard"},
 )
 REGISTRIES = {
     "dataset": DATASETS,
@@ -207,7 +200,7 @@ REGISTRIES = {
 PRESET_SETTINGS = {
     "loss": "ctm_plugin.color.settings:LossConfig",
     "trainer": "ctm_plugin.runs.settings:TrainerConfig",
-    "metrics": "ctm_plugin.metrics.settings:MetricsConfig",
+    "metrics": "ctm_plugin.runs.settings:MetricsConfig",
 }
 """Dataclasses of the groups whose choices differ only in values."""
 NOTHING = "ctm_plugin.settings.setting:Nothing"

@@ -201,15 +201,6 @@ def test_weight_zero_drops_a_term(dropped):
             torch.testing.assert_close(term, every[name])
 
 
-def test_all_weights_zero():
-    ctm = build_ctm(weights=LossWeights(**dict.fromkeys(TERMS, 0.0)))
-    source, rgb = Source(), rand(RAYS, 3)
-    terms, target = ctm.losses([rand(RAYS, 3, seed=1)], rgb, Photometric(), source)
-    assert terms == {}
-    assert source.drawn == []
-    torch.testing.assert_close(target, ctm.encode(rgb).detach())
-
-
 def test_cycle_loss():
     ctm, rgb, source = build_ctm(random_colors=RANDOM), rand(RAYS, 3), Source()
     loss = ctm.cycle_loss(rgb, source)

@@ -22,7 +22,7 @@ WORSE = {"psnr_lit": 23.0, "ssim_lit": 0.5}
         ({"detail": None, **LIT, **WORSE, "psnr_lit_photo": None}, None),
     ],
 )
-@pytest.mark.parametrize("budget", ["quick", "standard", None])
+@pytest.mark.parametrize("budget", ["quick", None])
 def test_when_and_what(recwarn, scores, told, budget):
     warn_of_failed_views(scores, budget)
     messages = [str(each.message) for each in recwarn]

@@ -26,7 +26,7 @@ from ctm_plugin.runs.video import write_video
 def run(trained) -> Path:
     """A dark scene in splats, 64 pixels wide."""
     data = ("dataset=still_life", "dataset.light=dark", "dataset.downscale=2", "ctm=auto", "dataset.skip=3")
-    sizes = ("backbone=splat", "backbone.steps=150", "backbone.reset_every=0", "trainer=smoke", "logger=none")
+    sizes = ("backbone=splat", "backbone.steps=50", "backbone.reset_every=0", "trainer=smoke", "logger=none")
     return trained("paged_splats", *data, *sizes, "trainer.image_every=null")
 
 

@@ -109,5 +109,5 @@ def test_keys_of_other_packages(monkeypatch):
 
 
 def test_composed_in_python():
-    for name in NAMES.split("|"):
+    for name in NAMES.split("|")[::6]:
         assert compose("dataset=colmap", f"dataset.root={name}")["dataset"]["root"] == name

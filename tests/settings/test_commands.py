@@ -34,9 +34,8 @@ def test_help_lists_all_verbs_then_what_people_choose_from(capsys):
 
 
 @pytest.mark.parametrize("name", BESIDE)
-@pytest.mark.parametrize("flag", ["-h", "--help"])
-def test_help_of_a_verb(name, flag, capsys):
-    assert cli.main([name, flag]) == 0
+def test_help_of_a_verb(name, capsys):
+    assert cli.main([name, "--help"]) == 0
     captured = capsys.readouterr()
     assert captured.err == ""
     usage, *lines = captured.out.splitlines()
@@ -113,7 +112,7 @@ def test_training_with_its_word(capsys):
     assert "preset: 'off'" in shown[0]
 
 
-@pytest.mark.parametrize("name", BESIDE)
+@pytest.mark.parametrize("name", ["cameras", "report"])
 @pytest.mark.parametrize(
     ("error", "code", "told"),
     [
@@ -149,14 +148,6 @@ def test_the_demo_tells_a_bad_key_before_it_trains(monkeypatch, capsys):
 def test_verbs_are_listed_without_torch():
     code = "import sys, ctm_plugin.cli; sys.exit(bool({'torch', 'lightning', 'numpy'} & sys.modules.keys()))"
     subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
-
-
-@pytest.mark.parametrize(
-    "arguments", ["list", "list backbone=dvgo", "export --help", "backbone.stepz=3", "ctm=onn", "+ctm=on ctm.lr=-1"]
-)
-def test_what_needs_no_torch_does_not_import_it(arguments):
-    code = "import sys; from ctm_plugin.cli import main; main(sys.argv[1:]); sys.exit('torch' in sys.modules)"
-    subprocess.run([sys.executable, "-c", code, *arguments.split()], check=True, timeout=120, capture_output=True)
 
 
 def test_a_verb_of_another_package(installed, capsys):
