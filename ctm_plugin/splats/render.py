@@ -111,7 +111,7 @@ def expected_depth(
 def bends(
     inverse: Float[Tensor, "h w"], stopped: Float[Tensor, "h w"], colors: Float[Tensor, "h w k"]
 ) -> Float[Tensor, ""]:
-    """Measure how far surfaces are from planes, the mean of ``|d(p-s) - 2 d(p) + d(p+s)| exp(-min(e / 0.03, 8)) W / s``.
+    """Measure how far surfaces are from planes: mean ``|d(p - s) - 2 d(p) + d(p + s)| exp(-min(e / 0.03, 8)) W / s``.
 
     d is the inverse depth, which is linear across the picture of a plane; s goes one way and the other; e is the larger
     of the two differences of colour. Large at a fold within one colour, nearly nothing where the picture has an edge.
