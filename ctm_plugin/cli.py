@@ -177,11 +177,14 @@ def print_list(*groups: Path, others: Sequence[str] = ()) -> None:
 
 
 def _complete(request: Sequence[str]) -> None:
-    """Print what a shell asks for: Hydra's script for it, or how its line may go on, verbs and their keys included."""
+    """Print what a shell asks for: a script for it, or how its line may go on, verbs and their keys included."""
     what, _, shell = " ".join(request).partition("=")
     if what not in ("install", "uninstall", "query") or shell not in commands.SHELLS:
         expected = f"install=SHELL or uninstall=SHELL, of {', '.join(commands.SHELLS)}"
         raise commands.UsageError(f"found {' '.join(request) or 'nothing'} after -sc, expected {expected}")
+    if script := commands.SHELL_SCRIPTS.get(" ".join(request)):
+        print(script)
+        return
     if what == "query":
         program, *words, last = os.environ.get("COMP_LINE", "ctm ").split(" ")
         verb = commands.VERBS.get(words[0]) if words else None

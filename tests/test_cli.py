@@ -2,6 +2,7 @@
 
 import errno
 import os
+import select
 import subprocess
 import sys
 import threading
@@ -131,6 +132,51 @@ def test_what_bash_is_told_to_run_completes(monkeypatch, capsys, tmp_path):
     script = ["bash", "-c", f"{capsys.readouterr().out}\n{words}"]
     done = subprocess.run(script, env=os.environ | path, capture_output=True, text=True, check=True)
     assert done.stdout == "backbone=splat\n"
+
+
+@pytest.fixture
+def shell(tmp_path, monkeypatch) -> dict[str, str]:
+    """The environment of a shell that finds ctm, in a folder with one other folder."""
+    (tmp_path / "bin").mkdir()
+    (tmp_path / "bin" / "ctm").write_text(f'#!/bin/sh\nexec "{sys.executable}" -m ctm_plugin "$@"\n')
+    (tmp_path / "bin" / "ctm").chmod(0o755)
+    (tmp_path / "große Halle").mkdir()
+    monkeypatch.chdir(tmp_path)
+    return os.environ | {"PATH": f"{tmp_path / 'bin'}:{os.environ['PATH']}", "HOME": str(tmp_path), "TERM": "dumb"}
+
+
+LINES = [("ctm ph", "photos"), ("ctm photos gro", "große Halle/"), ("ctm backbone=spl", "backbone=splat")]
+
+
+@pytest.mark.skipif(which("fish") is None, reason="no fish")
+@pytest.mark.parametrize(("line", "expected"), LINES)
+def test_what_fish_is_told_to_run_completes(shell, monkeypatch, capsys, line, expected):
+    monkeypatch.setattr(sys, "argv", ["/bin/ctm"])
+    assert main(["-sc", "install=fish"]) == 0
+    script = f"{capsys.readouterr().out}; complete -C '{line}'"
+    done = subprocess.run(["fish", "-c", script], env=shell, capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines()[0] == expected
+
+
+@pytest.mark.skipif(which("zsh") is None, reason="no zsh")
+@pytest.mark.parametrize(("line", "expected"), LINES)
+def test_what_zsh_is_told_to_run_completes(shell, capsys, line, expected):
+    """On a terminal, as zsh completes nowhere else; it shows the rest of the word, after a bell."""
+    assert main(["-sc", "install=zsh"]) == 0
+    Path("script").write_text(capsys.readouterr().out)
+    ours, its = os.openpty()
+    with subprocess.Popen(["zsh", "-f", "-i"], env=shell, stdin=its, stdout=its, stderr=its) as zsh:
+        os.close(its)
+        shown, typed, wanted = "", 'PS1=; source script; echo be""gun\n', "begun"
+        while True:
+            os.write(ours, typed.encode())
+            while wanted not in shown.replace("\a", "").replace("\\", ""):
+                assert select.select([ours], [], [], 60)[0], shown
+                shown += os.read(ours, 4096).decode()
+            if wanted == expected:
+                break
+            shown, typed, wanted = "", f"{line}\t", expected
+        zsh.kill()
 
 
 def test_a_shell_that_is_not_completed_in(capsys):

@@ -16,9 +16,9 @@ from torch import Tensor
 from ctm_plugin.appearance.exposure import PixelPlaces
 from ctm_plugin.appearance.photographed import exposed, photographed, undo_exposure
 from ctm_plugin.backbones.base import Backbone, Compared
-from ctm_plugin.color.light import AS_IS, Light, chosen_light, find_light
+from ctm_plugin.color.light import AS_IS, Light, chosen_light, find_light, squares
 from ctm_plugin.color.photometric import Photometric
-from ctm_plugin.color.prepare import SAMPLE_COLORS
+from ctm_plugin.color.srgb import linear_to_srgb
 from ctm_plugin.color.transform import ColorTransform, Uniform
 from ctm_plugin.draws import Draws
 from ctm_plugin.errors import CTMError
@@ -212,14 +212,17 @@ class PosedBackbone(Backbone):
             return Light(*self.scene.light)
         if self.appearance is None:
             return self._light
-        pixel = self._pixels(Draws(self.seed, 0, self.device, stream="colors"), SAMPLE_COLORS, self.unmasked)
-        colors = unit(self.pixels[pixel])
-        rgb = undo_exposure(self.appearance, colors[:, :3], self.place(pixel, colors[:, :3]))
-        return find_light(torch.cat([rgb, colors[:, 3:]], dim=1))
+        rgb, view, at = (each.to(self.device) for each in self._squares)
+        return find_light(undo_exposure(self.appearance, rgb, PixelPlaces(view, at, rgb)))
 
     @cached_property
     def _light(self) -> Light:
         return find_light(self.scene.train.images, self.scene.train.mask)
+
+    @cached_property
+    def _squares(self) -> tuple[Tensor, Tensor, Tensor]:
+        light, _, view, at = squares(self.scene.train.images, self.scene.train.mask)
+        return linear_to_srgb(light), view, at
 
     @property
     def snapshots(self) -> Sequence[int]:

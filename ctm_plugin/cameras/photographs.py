@@ -6,6 +6,7 @@ import os
 import re
 import warnings
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 
 from ctm_plugin.cameras.left_out import left_out
@@ -13,7 +14,8 @@ from ctm_plugin.cameras.settings import DEFAULT_FOLDER, MIN_PICTURES
 from ctm_plugin.data.readers.clip import CLIP_SUFFIXES
 from ctm_plugin.data.readers.colmap_model import searched_in
 from ctm_plugin.data.readers.folders import IMAGE_SUFFIXES, RAW_SUFFIXES, UNREAD_SUFFIXES, is_picture, others_hint
-from ctm_plugin.errors import DataError
+from ctm_plugin.data.readers.images import read_picture
+from ctm_plugin.errors import CTMError, DataError
 
 MODEL_FOLDER = Path("sparse", "0")
 """Folder inside the capture that ``ctm cameras`` writes its model to."""
@@ -23,6 +25,8 @@ NO_PHOTOGRAPHS = re.compile(r"\..*|(images?_)?masks?|masks_\d+|depths?|sparse|co
 """Pattern of the names of folders that hold no photographs of a capture."""
 SPLIT_DIGITS = re.compile(r"(\d+)").split
 """Splits a name at its numbers, so that 2 sorts before 10."""
+BLACK = 1.5 / 255
+"""Largest sRGB value of black pictures: the first grey level of 8 bits."""
 SYSTEM_FILES = ("Thumbs.db", "desktop.ini")
 """Files that Windows leaves in folders."""
 
@@ -57,7 +61,7 @@ def list_photographs(root: Path, name: str) -> list[Path]:
         warnings.warn(f"{place}: {len(others)} {what} are left out, as {others[0].name!r}", stacklevel=2)
         paths = [path for path in paths if path not in others]
     if len(paths) < MIN_PICTURES:
-        raise too_few(root, place, files, len(paths))
+        raise too_few(root, place, files, paths)
     known = (*IMAGE_SUFFIXES, *CLIP_SUFFIXES, *RAW_SUFFIXES)
     left = [path for path in files if path.suffix.lower() not in known and path.name not in SYSTEM_FILES]
     if left:
@@ -72,13 +76,22 @@ def added(root: Path, name: str) -> list[str]:
     return [each for each in names if each not in there]
 
 
-def too_few(root: Path, place: Path, files: Sequence[Path], count: int) -> DataError:
-    """Make the error that says why the folder ``place`` of ``root`` has fewer than ``MIN_PICTURES``."""
+def too_few(root: Path, place: Path, files: Sequence[Path], paths: Sequence[Path]) -> DataError:
+    """Make the error that says why the folder ``place`` of ``root`` has fewer than ``MIN_PICTURES``: ``paths``."""
     if not place.is_dir():
         there = ", ".join(sorted(path.name for path in root.iterdir() if path.is_dir())) or "no folders"
         return DataError(root, there, f"photographs in {place.name}; for others, ctm cameras FOLDER pictures=NAME")
+    count = sum(map(is_picture, files))
+    with suppress(CTMError):  # those that cannot be read are not black
+        if count >= MIN_PICTURES and all(float(read_picture(path).image()[..., :3].max()) <= BLACK for path in paths):
+            return all_black(place, count)  # copies of one another
     foreign = [path for path in files if path.suffix.lower() in UNREAD_SUFFIXES]
     expected = f"at least {MIN_PICTURES} ending in {', '.join(IMAGE_SUFFIXES)}"
     if foreign:
         expected += f"; {others_hint(foreign)}"
-    return DataError(place, f"{count} pictures", expected)
+    return DataError(place, f"{len(paths)} pictures", expected)
+
+
+def all_black(place: Path, count: int) -> DataError:
+    """Make the error for a folder all of whose pictures are black."""
+    return DataError(place, f"{count} black pictures", "photographs with some light")

@@ -19,6 +19,7 @@ from ctm_plugin.cameras.colmap import CLOSER, FEWER_MATCHES, STANDARD, Features,
 from ctm_plugin.cameras.learned import PACKAGE, find_details, has_network, nearest_to_each_other
 from ctm_plugin.cameras.lenses import tell_lenses_apart
 from ctm_plugin.cameras.pairs import VOTERS, all_pairs, likely_pairs
+from ctm_plugin.cameras.photographs import BLACK, all_black
 from ctm_plugin.cameras.refine import Light, blurred, refine
 from ctm_plugin.cameras.settings import MIN_PICTURES, CamerasConfig
 from ctm_plugin.cameras.sharpness import unsharp
@@ -81,11 +82,13 @@ def find_cameras(
     neighbours are left out.
 
     Raises:
-        DataError: too few pictures get a pose, or they have too few observations.
+        DataError: all pictures are black, too few get a pose, or they have too few observations.
     """
     paths, headers, gain, best = [each.path for each in pictures], [each.header for each in pictures], 1.0, Trusted()
     with ThreadPoolExecutor(None if settings.threads < 0 else settings.threads) as pool:
         lights = list(with_progress("brightness", pool.map(partial(read_light, size=settings.size), pictures), paths))
+        if all(float(as_grey(each.light).max()) <= BLACK for each in lights):
+            raise all_black(paths[0].parent, len(paths))
         sensors = [(header.lens, *sorted(header[:2])) for header in headers]
         if soft := unsharp([each.light.numpy() for each in lights], sensors):
             say(f"{len(soft)} pictures far less sharp than their neighbours are left out, as {names[soft[0]]!r}")

@@ -52,6 +52,8 @@ HISTOGRAM_BINS = 65536
 """Number of bins in the histogram of averaged colours."""
 LUMINANCE = (0.2126, 0.7152, 0.0722)
 """Weights of red, green and blue in the luminance of linear sRGB (IEC 61966-2-1)."""
+PALE = 3e-5
+"""Linear light whose colours are halved, a tenth of the first grey level of 8 bits: photographs have noise there."""
 KNEE = 0.5
 """Linear light above which the shoulder bends: one stop below white."""
 MIN_GAIN = 2.0**0.5
@@ -68,11 +70,12 @@ class Light:
 
     Linear light x of a pixel, with luminance l = 0.2126 r + 0.7152 g + 0.0722 b, becomes sRGB y by::
 
-        x' = max(0, l + saturation (x - l))
+        x' = max(0, l + saturation l / (l + 3e-5) (x - l))
         t  = srgb(shoulder(gain x', gain))
         y  = t^contrast / (t^contrast + (1 - t)^contrast)
 
-    Greys stay grey, black and white stay, and on greys it rises all the way.
+    Greys stay grey, black and white stay, and on greys it rises all the way. Next to black colours fade, as photographs
+    have nothing but noise there.
 
     Attributes:
         gain: factor on linear light, > 0.
@@ -91,11 +94,6 @@ class Light:
         light = saturated(srgb_to_linear(rgb), self.saturation) * self.gain
         return contrasted(linear_to_srgb(shoulder(light, self.gain).clamp(0.0, 1.0)), self.contrast)
 
-    def inverse(self, rgb: Float[Tensor, "*shape 3"]) -> Float[Tensor, "*shape 3"]:
-        """Undo :meth:`apply`, of colours that it did not cut off; not of saturation 0."""
-        light = unbent(srgb_to_linear(contrasted(rgb, 1 / self.contrast)), self.gain) / self.gain
-        return linear_to_srgb(saturated(light, 1 / self.saturation).clamp(0.0, 1.0))
-
 
 AS_IS = Light()
 """The light that leaves pictures as they are."""
@@ -113,15 +111,13 @@ def chosen_light(settings: LightConfig, auto: Light) -> Light:
 
 
 def saturated(light: Float[Tensor, "*shape 3"], saturation: float) -> Float[Tensor, "*shape 3"]:
-    """Multiply linear light's distance from grey by ``saturation``; negative light is cut to 0."""
-    if saturation == 1:
-        return light
+    """Multiply linear light's distance from grey l by ``saturation l / (l + PALE)``; negative light is cut to 0."""
     grey = (light @ light.new_tensor(LUMINANCE))[..., None]
-    return (grey + saturation * (light - grey)).clamp(min=0.0)
+    return (grey + saturation * grey / (grey + PALE) * (light - grey)).clamp(min=0.0)
 
 
 def contrasted(srgb: Float[Tensor, "*shape"], contrast: float) -> Float[Tensor, "*shape"]:
-    """Apply contrast k to sRGB t in [0, 1]: ``t^k / (t^k + (1 - t)^k)``; contrast 1 / k undoes it."""
+    """Apply contrast k to sRGB t in [0, 1]: ``t^k / (t^k + (1 - t)^k)``."""
     if contrast == 1:
         return srgb
     bright = srgb**contrast
@@ -158,15 +154,6 @@ def shoulder(light: Float[Tensor, "*shape"], white: float) -> Float[Tensor, "*sh
     above = (light - KNEE).clamp(min=0) / (1 - KNEE)
     top = max(white - KNEE, 1 - KNEE) / (1 - KNEE)
     return light.clamp(max=KNEE) + (1 - KNEE) * above * (1 + above / top**2) / (1 + above)
-
-
-def unbent(light: Float[Tensor, "*shape"], white: float) -> Float[Tensor, "*shape"]:
-    """Undo :func:`shoulder`: the positive root of ``t^2 / T^2 + (1 - u) t - u``, u and t the light above the knee."""
-    above = (light - KNEE).clamp(min=0) / (1 - KNEE)
-    top = max(white - KNEE, 1 - KNEE) / (1 - KNEE)
-    slope = 1 - above
-    root = 2 * above / (slope + (slope**2 + 4 * above / top**2).sqrt()).clamp(min=1e-30)
-    return light.clamp(max=KNEE) + (1 - KNEE) * root
 
 
 def enhancement_gain(
@@ -218,7 +205,7 @@ def find_light(
     Returns:
         A light that changes nothing, or brightens by at least half a stop (1.41).
     """
-    light, counts = squares(colors, mask)
+    light, counts, *_ = squares(colors, mask)
     kept = room(light, counts)
     light, counts = light[kept], counts[kept]
     bright = light.amax(1)
@@ -259,9 +246,22 @@ def room(light: Float[Tensor, "s 3"], counts: Float64[Tensor, " s"]) -> Bool[Ten
     return luminance <= 2 ** (median + max(ROOM_STOPS, ROOM_SPREADS * (median - dark)))
 
 
+class Squares(NamedTuple):
+    """Squares of pictures ``[N, H, W, C]``, and the light that they have on average."""
+
+    light: Float[Tensor, "s 3"]
+    """Mean linear light of the pixels that count."""
+    counts: Float64[Tensor, " s"]
+    """Number of pixels that count."""
+    view: Int64[Tensor, " s"]
+    """Index of the picture."""
+    at: Float[Tensor, "s 2"]
+    """Middle of the square in the picture: x to the right and y down, each from 0 to 1."""
+
+
 def squares(
     colors: UInt8[Tensor, "*shape c"] | Float[Tensor, "*shape c"], mask: Bool[Tensor, "*shape"] | None = None
-) -> tuple[Float[Tensor, "s 3"], Float64[Tensor, " s"]]:
+) -> Squares:
     """Average linear light over squares of pictures ``[N, H, W, C]``; colours of other shapes are not averaged.
 
     Args:
@@ -269,13 +269,16 @@ def squares(
         mask: which pixels count; ``None``: all do.
 
     Returns:
-        Light of squares with pixels that count, and their number. Rows and columns that fill no square are left out.
+        The squares with pixels that count. Rows and columns that fill no square are left out.
     """
     table = srgb_to_linear(torch.arange(256) / 255)
     batched = colors.ndim == 4
     pictures, masks = (colors, mask) if batched else (colors.reshape(1, 1, -1, colors.shape[-1]), mask)
     side = max(1, round(min(pictures.shape[1:3]) / SQUARES_ACROSS)) if batched else 1
-    means, counts = [], []
+    height, width = pictures.shape[1:3]
+    row, column = torch.meshgrid(torch.arange(height // side), torch.arange(width // side), indexing="ij")
+    middles = torch.stack([(column + 0.5) * side / width, (row + 0.5) * side / height], -1)
+    means, counts, views, places = [], [], [], []
     for index, picture in enumerate(pictures):
         code = picture[..., :3].detach().cpu()
         if code.dtype == torch.uint8:
@@ -287,14 +290,15 @@ def squares(
             there = picture[..., 3].detach().cpu() > 0
             counted = there if counted is None else there & counted
         if counted is None:
-            means.append(tiled(light, side).flatten(0, 1) / side**2)
-            counts.append(torch.full((len(means[-1]),), float(side**2), dtype=torch.float64))
-            continue
-        number = tiled(counted[..., None].double(), side)[..., 0]
+            number = torch.full(middles.shape[:2], float(side**2), dtype=torch.float64)
+        else:
+            light, number = light * counted[..., None], tiled(counted[..., None].double(), side)[..., 0]
         kept = number > 0
-        means.append(tiled(light * counted[..., None], side)[kept] / number[kept, None].float())
+        means.append(tiled(light, side)[kept] / number[kept, None].float())
         counts.append(number[kept])
-    return torch.cat(means), torch.cat(counts)
+        views.append(torch.full((len(counts[-1]),), index))
+        places.append(middles[kept])
+    return Squares(*map(torch.cat, (means, counts, views, places)))
 
 
 def tiled(values: Float[Tensor, "h w c"], side: int) -> Float[Tensor, "rows columns c"]:

@@ -22,6 +22,8 @@ RAWNERF_SCENES = (
     "streetcorner",
 )  # fmt: skip
 """RawNeRF's scenes that the paper uses."""
+FULL = "full"
+"""Width of pictures that are not shrunk."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,8 +56,11 @@ class PhotoConfig(DimConfig):
     downscale: Number = setting(
         1, "number, whole or not, that both sides of the pictures are divided by", least=1, most=1e6
     )
-    width: int | None = setting(
-        None, "width that the pictures are shrunk to, instead of downscale; the height follows", least=1
+    width: int | str | None = setting(
+        None,
+        "width that the pictures are shrunk to, instead of downscale; the height follows; full, or null: their own",
+        least=1,
+        choices=(FULL,),
     )
     skip: int = setting(1, "train on every skip-th training view, from the first; all test views stay", least=1)
     background: str = setting(
@@ -80,6 +85,8 @@ class PhotoConfig(DimConfig):
         super().__post_init__()
         if self.width is not None and self.downscale != type(self).__dataclass_fields__["downscale"].default:
             raise self.fault("width", f"null with dataset.downscale={self.downscale}")
+        if self.width == FULL:
+            object.__setattr__(self, "width", None)
 
     @property
     def whole_factor(self) -> int:

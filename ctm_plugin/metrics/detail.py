@@ -23,9 +23,10 @@ MIN_BAND = 1e-6
 """Least absolute value of a picture's fine band; smaller ones are float32's rounding of flat areas."""
 MIN_DETAIL = 0.05
 """Least share of the photograph's fine variance that must be detail for a score: noise is not known more exactly."""
-MIN_SQUARES = 40
-"""Least number of squares of a view with a score: fewer, as at 100x75 pixels, hold too few flat ones to know its
-noise."""
+MIN_SQUARES = 250
+"""Least number of squares of a view with a score. With fewer, none is flat: of nine photographs without noise, up to
+0.67 of the fine variance counted as noise at 128x96 pixels, 0.41 at 160x120, 0.24 at 200x150, but 0.11 of all but one
+(fur: 0.25) at 250x188, which have 280."""
 
 
 def detail_moments(

@@ -43,7 +43,20 @@ BARE_FLAGS = shlex.split("-m --multirun -r --run -c --cfg -i --info")
 DRY_RUN = "--cfg", "-c"
 """Hydra's flag for verbs with a dry run, with the value ``job``."""
 SHELLS = "bash", "zsh", "fish"
-"""Shells whose command lines Hydra completes."""
+"""Shells whose command lines are completed."""
+SHELL_SCRIPTS = {
+    "install=zsh": """\
+(( $+functions[compdef] )) || { autoload -Uz compinit && compinit }
+_ctm() {
+    compadd -S '' -- ${=$(COMP_LINE="${(j: :)words[1,CURRENT]}" $words[1] -sc query=zsh)}
+    _files
+}
+compdef _ctm ctm""",
+    "uninstall=zsh": "compdef -d ctm",
+    "install=fish": "complete -c ctm -a '(COMP_LINE=(commandline -cp) ctm -sc query=fish)'",
+    "uninstall=fish": "complete -c ctm -e",
+}
+"""Scripts in place of Hydra's: its script for zsh is bash's, which fails there; in fish it completes no paths."""
 
 
 class UsageError(CTMError):

@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from ctm_plugin.appearance.exposure import Exposure
+from ctm_plugin.color.light import find_light
 from ctm_plugin.color.srgb import linear_to_srgb, srgb_to_linear
 from ctm_plugin.draws import Draws
 from ctm_plugin.errors import ConfigError
@@ -79,6 +80,22 @@ def test_where_pixels_lie(compose):
     assert place.view.tolist() == [0, 0, 0, 3]
     expected = torch.tensor([[0.5, 0.5], [11.5, 0.5], [0.5, 11.5], [2.5, 1.5]]) / 12
     torch.testing.assert_close(place.at, expected)
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.002])
+def test_its_light_is_that_of_pictures_of_one_exposure_without_noise(compose, noise):
+    module = assemble(compose(*SMALL, "appearance=exposure")).backbone
+    draws = torch.Generator().manual_seed(0)
+    coarse = torch.rand(8, 3, 6, 7, generator=draws)
+    lit = torch.nn.functional.interpolate(coarse, (384, 480), mode="bilinear").permute(0, 2, 3, 1)
+    light = 0.02 * srgb_to_linear(0.1 + 0.8 * lit)
+    gains = torch.linspace(-0.7, 0.7, 8)
+    shown = light * gains.exp()[:, None, None, None] + noise * torch.randn(light.shape, generator=draws)
+    train = replace(module.scene.train, images=linear_to_srgb(shown.clamp(0, 1)), mask=None, sizes=None)
+    module.appearance.log_gain.data, module.scene = gains, replace(module.scene, train=train)
+    found, expected = module.light, find_light(linear_to_srgb(light))
+    assert found.gain == pytest.approx(expected.gain, rel=0.06)  # two of the steps that are tried
+    assert found.contrast == pytest.approx(expected.contrast, abs=0.041)
 
 
 def test_its_own_optimizer(compose):

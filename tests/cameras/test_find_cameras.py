@@ -305,6 +305,16 @@ def test_loose_photographs_that_are_too_few(tmp_path, refused, names, count, hin
     assert error.endswith(hint.format(root))
 
 
+@pytest.mark.parametrize("alike", [True, False])
+def test_black_photographs(tmp_path, refused, alike):
+    """Copies of one another, and not; one has a grey level of 8 bits."""
+    for number in range(4):
+        picture = np.zeros((64, 80 if alike else 80 + number, 3), dtype=np.uint8)
+        picture[:number] = not alike
+        iio.imwrite(tmp_path / f"{number}.png", picture)
+    assert f"{tmp_path}: found 4 black pictures, expected photographs with some light\n" in refused("cameras", tmp_path)
+
+
 def test_a_folder_that_cannot_be_written_to(three, monkeypatch, refused):
     """Cameras are put beside the photographs, and no key moves them."""
 

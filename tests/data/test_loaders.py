@@ -38,6 +38,10 @@ def load(root, layout):
 
 
 @pytest.mark.parametrize("layout", MAKE)
+def test_pictures_of_their_own_width(load):
+    assert torch.equal(load(width="full").train.images, load().train.images)
+
+
 @pytest.mark.parametrize("settings", [{"downscale": 2}, {"downscale": 1.4}, {"downscale": 3}, {"width": 5}])
 def test_any_factor_and_width(load, settings):
     whole, small = load().test, load(**settings).test
@@ -124,6 +128,8 @@ def test_random_matched_needs_alpha(load):
         ({"downscale": 50}, r"dataset\.downscale: found 50, expected at most a side of the pictures, \d+x"),
         ({"width": 99}, r"dataset\.width: found 99, expected at most that of the pictures, \d+x"),
         ({"width": 4, "downscale": 2}, r"dataset\.width: found 4, expected null with dataset\.downscale=2"),
+        ({"width": "full", "downscale": 2}, r"dataset\.width: found 'full', expected null with dataset\.downscale=2"),
+        ({"width": "half"}, r"dataset\.width: found 'half', expected an integer >= 1, full or null"),
     ],
 )
 def test_settings_that_cannot_be(load, settings, found):

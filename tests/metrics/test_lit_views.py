@@ -11,8 +11,7 @@ from ctm_plugin.metrics.image import best_constant_psnr, psnr, ssim
 from ctm_plugin.metrics.lpips import LPIPS
 
 NAMES = ("a", "b", "c")
-FACTOR = 9.0
-LIGHT = Light(FACTOR)
+LIGHT = Light(9.0)
 
 
 @pytest.fixture
@@ -60,7 +59,7 @@ def test_lit_scores_beside_the_dark_ones(scene):
     assert {key: found[key] for key in alone if key != "per_image"} == {
         key: value for key, value in alone.items() if key != "per_image"
     }
-    lit, photo = brighten(predictions, FACTOR), brighten(targets, FACTOR)
+    lit, photo = LIGHT.apply(predictions), LIGHT.apply(targets)
     for suffix, image in (("", lit), ("_photo", photo)):
         assert found[f"psnr_lit{suffix}"] == pytest.approx(float(psnr(image, references).mean()))
         assert found[f"ssim_lit{suffix}"] == pytest.approx(float(ssim(image, references).mean()))
@@ -122,7 +121,7 @@ def test_views_without_a_picture_are_not_scored(scene):
     found = summarize(NAMES, predictions, [None] * 3, None, references=references, light=LIGHT)
     for key in ("psnr", "ssim", "psnr_enhanced", "enhancement_gain", "converged", "constant_psnr", "psnr_lit_photo"):
         assert found[key] is None, key
-    assert found["psnr_lit"] == pytest.approx(float(psnr(brighten(predictions, FACTOR), references).mean()))
+    assert found["psnr_lit"] == pytest.approx(float(psnr(LIGHT.apply(predictions), references).mean()))
 
 
 def test_pictures_of_one_colour_have_a_fit():

@@ -137,9 +137,9 @@ def test_lit_views_masks_and_missing_pictures(dark, tmp_path):
 def test_a_run_of_few_steps_warns_and_says_what_to_try(dark, tmp_path):
     run = load_run(dark)
     module, test = run.module, run.module.scene.test
-    shape = (len(test), 100, 100, test.images.shape[-1])  # room for detail, and flat squares, which have no noise
+    shape = (len(test), 210, 210, test.images.shape[-1])  # flat squares, which have no noise, of all brightnesses
     images = torch.randint(0, 60, shape, dtype=torch.uint8, generator=torch.Generator().manual_seed(0))
-    images[:, :40] = 30
+    images[:, :84] = torch.linspace(0, 60, 210).round().byte()[:, None]
     module.scene = replace(module.scene, test=replace(test, images=images, depth=None))
     with pytest.warns(UserWarning, match="show 0.0. of the real detail .* try trainer=standard"):
         found = score(module, run.config, tmp_path, (None, ""), run.step, run.spent)
