@@ -6,6 +6,7 @@ Only on CPUs, which is what pycolmap's wheels are made for.
 from __future__ import annotations
 
 import math
+import signal
 import tempfile
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
@@ -21,7 +22,7 @@ from torch import Tensor
 
 from ctm_plugin.cameras.settings import MIN_PICTURES
 from ctm_plugin.data.readers.picture import Header
-from ctm_plugin.errors import CTMError
+from ctm_plugin.errors import CTMError, handling
 
 Reconstruction = Any
 """``pycolmap.Reconstruction``; ``pycolmap`` is imported only when it is used."""
@@ -223,7 +224,8 @@ def adjust(model: Reconstruction, threads: int, tolerance: float = 1e-6) -> None
 def require_pycolmap() -> ModuleType:
     """Import pycolmap, set to print only errors; a message names the extra that installs it."""
     try:
-        import pycolmap  # after Pillow, imported above: the zlib that its wheel shows would be taken for Pillow's
+        with handling(signal.SIG_DFL, signal.SIGTERM):  # pycolmap would print its C++ stack at SIGTERM
+            import pycolmap  # after Pillow, imported above: the zlib that its wheel shows would be taken for Pillow's
     except ImportError as error:
         raise CTMError(f"finding cameras needs pycolmap: pip install -e '.[colmap]' ({error})") from error
     pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value

@@ -4,6 +4,7 @@ import errno
 import re
 import runpy
 import shutil
+import signal
 import subprocess
 import sys
 from importlib.util import find_spec
@@ -153,6 +154,13 @@ def test_the_folder_is_read_afterwards(dark):
     assert 0 < scene.near < scene.far
     stored = iio.imread(dark / "images" / TURNED, plugin="pillow")
     np.testing.assert_array_equal(scene.train.images[scene.train.names.index("corner 4")], stored[::-1, ::-1])
+
+
+@COLMAP
+def test_sigterm_ends_without_a_stack():
+    code = "import signal; from ctm_plugin.cameras.colmap import require_pycolmap; require_pycolmap()\n"
+    done = subprocess.run([sys.executable, "-c", f"{code}signal.raise_signal(signal.SIGTERM)"], capture_output=True)
+    assert (done.returncode, done.stdout, done.stderr) == (-signal.SIGTERM, b"", b"")
 
 
 def spread_of(root: Path) -> float:
