@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tempfile
 import time
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -115,7 +116,7 @@ def find_cameras(
                 with stage("placed", len(paths)) as done:
                     model = trusted(work.reconstruct(names, start, done), work.database)
                 if (model.sights, model.placed) > (best.sights, best.placed):
-                    best, taken = model, rung
+                    best, taken, source, begin = model, rung, work, start
                 if sound := best.placed >= ENOUGH_PLACED * len(paths) and not best.taken_out:
                     break
                 if start is not CLOSER:
@@ -139,12 +140,16 @@ def find_cameras(
             paths[0].parent, found, f"for {MIN_PICTURES} at least, {MIN_OBSERVATIONS} such points each: {more}{hint}"
         )
     silent = [number for number, header in enumerate(headers, 1) if header.lens.film is None]
-    model, lengths = tell_lenses_apart(best.model, silent, settings.threads)
-    if lengths:
-        say(f"{len(lengths)} lenses without EXIF, of {', '.join(f'{each:.0f}' for each in lengths)} pixels")
+    if focal := tell_lenses_apart(best.model, silent, settings.threads):
+        lengths = [f"{each:.0f}" for each in sorted({*focal.values()})]
+        say(f"{len(lengths)} lenses without EXIF, of {', '.join(lengths)} pixels: placed again")
+        with tempfile.TemporaryDirectory(dir=folder) as copy, stage("placed", len(paths)) as done:
+            work = source.with_lenses(Path(copy), headers, focal, settings.lens, pairs)
+            again = trusted(work.reconstruct(names, begin, done), work.database)
+        best = max(best, again, key=lambda each: (each.sights, each.placed))
     with stage("refined", taken.refined[1]) as done:
-        refine(model, lights, *taken.refined, settings.threads, done)
-    return best._replace(model=model, sights=sights(model)), gain
+        refine(best.model, lights, *taken.refined, settings.threads, done)
+    return best._replace(sights=sights(best.model)), gain
 
 
 def told(trusted: Trusted, count: int) -> str:

@@ -24,7 +24,7 @@ from scipy.spatial.transform import Rotation
 
 from ctm_plugin import cli
 from ctm_plugin.cameras import command
-from ctm_plugin.cameras.colmap import FILM_DIAGONAL, focal_length
+from ctm_plugin.cameras.colmap import FILM_DIAGONAL, focal_length, with_focal_length
 from ctm_plugin.cameras.exposures import UNEVEN
 from ctm_plugin.cameras.photographs import home_of, list_photographs
 from ctm_plugin.cameras.trust import Trusted
@@ -392,6 +392,8 @@ def test_the_first_focal_length_is_that_of_the_file(said, focal):
     """A picture of 40x30 has a diagonal of 50 pixels, one of 36x24 mm of 43.27 mm."""
     header = Header(30, 40, alpha=False, lens=Lens(film=said))
     assert focal_length(header) == (pytest.approx(focal), said is not None)
+    assert with_focal_length(header, None) is header
+    assert focal_length(with_focal_length(header, 33.0)) == (pytest.approx(33.0), True)
 
 
 def test_the_comparison_knows_similarities():

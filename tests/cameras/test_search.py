@@ -28,12 +28,11 @@ def searched(tmp_path, monkeypatch):
     """Search where COLMAP finds canned models in turn; noted is which details and start each was asked for with."""
     monkeypatch.setattr(search, "refine", lambda model, lights, reach, rounds, threads, done: done(rounds))
     monkeypatch.setattr(search, "sights", lambda model: 7)
-    monkeypatch.setattr(search, "tell_lenses_apart", lambda model, silent, threads: (model, []))
     for name in "abcd":
         iio.imwrite(tmp_path / f"{name}.png", np.full((6, 8, 3), 9, dtype=np.uint8))
     pictures = [read_picture(path) for path in sorted(tmp_path.glob("*.png"))]
 
-    def search_for(*models: Trusted, matched: int = 6, network: bool = False):
+    def search_for(*models: Trusted, matched: int = 6, network: bool = False, focal: dict[int, float] | None = None):
         left, noted = list(models), []
 
         class Canned:
@@ -54,11 +53,16 @@ def searched(tmp_path, monkeypatch):
                 done(len(pairs))
                 return matched
 
+            def with_lenses(self, folder, headers, given, lens, pairs):
+                assert given is focal
+                return Canned(Path("lenses"), 1, 0)
+
             def reconstruct(self, names, start, done):
                 done(3)
                 noted.append((self.folder.name, start))
                 return left.pop(0)
 
+        monkeypatch.setattr(search, "tell_lenses_apart", lambda model, silent, threads: focal or {})
         monkeypatch.setattr(search, "Workshop", Canned)
         monkeypatch.setattr(search, "has_network", lambda: network)
         monkeypatch.setattr(search, "find_details", lambda grey: (torch.zeros(5, 2), torch.zeros(5, 64)))
@@ -105,6 +109,17 @@ def test_thin_models_are_searched_again_with_pooled_details(searched, capsys):
     assert searched(NOISY, GOOD) == ("good", [("usual", STANDARD), ("pooled", FEWER_MATCHES)])
     assert "a mean one sees 80 points that two others see: searched again for details pooled" in capsys.readouterr().err
     assert searched(NOISY, FEW)[0] == "noisy"
+
+
+def test_pictures_of_two_lenses_are_placed_again(searched, capsys):
+    """From the start that placed them before; if fewer sights hold that, it is not taken."""
+    focal = {1: 300.0, 2: 600.0, 3: 300.0, 4: 600.0}
+    assert searched(FEW, THIN, GOOD, focal=focal) == (
+        "good",
+        [("usual", STANDARD), ("usual", CLOSER), ("lenses", CLOSER)],
+    )
+    assert "2 lenses without EXIF, of 300, 600 pixels: placed again\n" in capsys.readouterr().err
+    assert searched(GOOD, THIN, focal=focal)[0] == "good"
 
 
 @pytest.mark.parametrize(
