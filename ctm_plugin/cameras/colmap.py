@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import signal
 import tempfile
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import ModuleType
@@ -161,17 +161,11 @@ class Workshop:
         database.close()
         return sum(count >= checking.min_num_inliers for count in inliers)
 
-    def with_lenses(
-        self,
-        folder: Path,
-        headers: Sequence[Header],
-        focal: Mapping[int, float],
-        lens: str,
-        pairs: Sequence[tuple[int, int]],
-    ) -> Workshop:
-        """Copy keypoints and matches into ``folder``, verified with focal lengths in pixels, by picture number."""
-        database, copy = require_pycolmap().Database.open(self.database), replace(self, folder=folder)
-        headers = [with_focal_length(header, focal.get(number)) for number, header in enumerate(headers, 1)]
+    def with_headers(self, headers: Sequence[Header], lens: str, pairs: Sequence[tuple[int, int]]) -> Workshop:
+        """Copy keypoints and matches into a folder below, with these headers' lenses, by which matches are verified."""
+        copy = replace(self, folder=self.folder / "lenses")
+        copy.folder.mkdir(exist_ok=True)
+        database = require_pycolmap().Database.open(self.database)
         places = (database.read_keypoints(number) for number in range(1, len(headers) + 1))
         copy.store(headers, lens, (Features(each, torch.empty(0)) for each in places))
         copy.match(pairs, lambda _: None, database.read_matches)
@@ -255,14 +249,6 @@ def focal_length(header: Header) -> tuple[float, bool]:
     if film is None:
         return 1.2 * max(header.height, header.width), False
     return film * math.hypot(header.height, header.width) / FILM_DIAGONAL, True
-
-
-def with_focal_length(header: Header, focal: float | None) -> Header:
-    """Copy a header, with a focal length in pixels as if by EXIF; ``None``: with its own."""
-    if focal is None:
-        return header
-    film = focal * FILM_DIAGONAL / math.hypot(header.height, header.width)
-    return header._replace(lens=header.lens._replace(film=film))
 
 
 def extract(picture: Float32[np.ndarray, "h w"], scale: int, pooled: bool) -> Features:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tempfile
 import time
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -18,7 +17,7 @@ from torch import Tensor
 
 from ctm_plugin.cameras.colmap import CLOSER, FEWER_MATCHES, STANDARD, Features, Workshop, extract, sights
 from ctm_plugin.cameras.learned import PACKAGE, find_details, has_network, nearest_to_each_other
-from ctm_plugin.cameras.lenses import tell_lenses_apart
+from ctm_plugin.cameras.lenses import tell_lenses_apart, with_focal_length
 from ctm_plugin.cameras.pairs import VOTERS, all_pairs, likely_pairs
 from ctm_plugin.cameras.refine import Light, blurred, refine
 from ctm_plugin.cameras.settings import MIN_PICTURES, CamerasConfig
@@ -114,9 +113,18 @@ def find_cameras(
                 matched = work.match(pairs, done, nearest)
             for start in (rung.start, CLOSER)[: 2 if matched else 0]:
                 with stage("placed", len(paths)) as done:
-                    model = trusted(work.reconstruct(names, start, done), work.database)
+                    model = work.reconstruct(names, start, done)
+                silent = [number for number, header in enumerate(headers, 1) if header.lens.film is None]
+                if model is not None and (focal := tell_lenses_apart(model, silent, settings.threads)):
+                    lengths = [f"{each:.0f}" for each in sorted({*focal.values()})]
+                    say(f"{len(lengths)} lenses without EXIF, of {', '.join(lengths)} pixels: placed again")
+                    headers = [with_focal_length(each, focal.get(number)) for number, each in enumerate(headers, 1)]
+                    work = work.with_headers(headers, settings.lens, pairs)
+                    with stage("placed", len(paths)) as done:
+                        model = work.reconstruct(names, start, done)
+                model = trusted(model, work.database)
                 if (model.sights, model.placed) > (best.sights, best.placed):
-                    best, taken, source, begin = model, rung, work, start
+                    best, taken = model, rung
                 if sound := best.placed >= ENOUGH_PLACED * len(paths) and not best.taken_out:
                     break
                 if start is not CLOSER:
@@ -139,14 +147,6 @@ def find_cameras(
         raise DataError(
             paths[0].parent, found, f"for {MIN_PICTURES} at least, {MIN_OBSERVATIONS} such points each: {more}{hint}"
         )
-    silent = [number for number, header in enumerate(headers, 1) if header.lens.film is None]
-    if focal := tell_lenses_apart(best.model, silent, settings.threads):
-        lengths = [f"{each:.0f}" for each in sorted({*focal.values()})]
-        say(f"{len(lengths)} lenses without EXIF, of {', '.join(lengths)} pixels: placed again")
-        with tempfile.TemporaryDirectory(dir=folder) as copy, stage("placed", len(paths)) as done:
-            work = source.with_lenses(Path(copy), headers, focal, settings.lens, pairs)
-            again = trusted(work.reconstruct(names, begin, done), work.database)
-        best = max(best, again, key=lambda each: (each.sights, each.placed))
     with stage("refined", taken.refined[1]) as done:
         refine(best.model, lights, *taken.refined, settings.threads, done)
     return best._replace(sights=sights(best.model)), gain

@@ -24,8 +24,9 @@ from scipy.spatial.transform import Rotation
 
 from ctm_plugin import cli
 from ctm_plugin.cameras import command
-from ctm_plugin.cameras.colmap import FILM_DIAGONAL, focal_length, with_focal_length
+from ctm_plugin.cameras.colmap import FILM_DIAGONAL, focal_length
 from ctm_plugin.cameras.exposures import UNEVEN
+from ctm_plugin.cameras.lenses import with_focal_length
 from ctm_plugin.cameras.photographs import home_of, list_photographs
 from ctm_plugin.cameras.trust import Trusted
 from ctm_plugin.color.srgb import linear_to_srgb
