@@ -113,16 +113,15 @@ def find_cameras(
                 matched = work.match(pairs, done, nearest)
             for start in (rung.start, CLOSER)[: 2 if matched else 0]:
                 with stage("placed", len(paths)) as done:
-                    model = work.reconstruct(names, start, done)
+                    model = trusted(work.reconstruct(names, start, done), work.database)
                 silent = [number for number, header in enumerate(headers, 1) if header.lens.film is None]
-                if model is not None and (focal := tell_lenses_apart(model, silent, settings.threads)):
+                if model.placed and (focal := tell_lenses_apart(model.model, silent, settings.threads)):
                     lengths = [f"{each:.0f}" for each in sorted({*focal.values()})]
                     say(f"{len(lengths)} lenses without EXIF, of {', '.join(lengths)} pixels: placed again")
                     headers = [with_focal_length(each, focal.get(number)) for number, each in enumerate(headers, 1)]
                     work = work.with_headers(headers, settings.lens, pairs)
                     with stage("placed", len(paths)) as done:
-                        model = work.reconstruct(names, start, done)
-                model = trusted(model, work.database)
+                        model = trusted(work.reconstruct(names, start, done), work.database)
                 if (model.sights, model.placed) > (best.sights, best.placed):
                     best, taken = model, rung
                 if sound := best.placed >= ENOUGH_PLACED * len(paths) and not best.taken_out:

@@ -68,7 +68,7 @@ def searched(tmp_path, monkeypatch):
             search,
             "tell_lenses_apart",
             lambda model, silent, threads: (
-                dict.fromkeys(silent, 300.0) | {1: 600.0} if model is MIXED and silent else {}
+                dict.fromkeys(silent, 300.0) | {1: 600.0} if model == "mixed" and silent else {}
             ),
         )
         monkeypatch.setattr(search, "Workshop", Canned)
