@@ -6,9 +6,10 @@ Only on CPUs, which is what pycolmap's wheels are made for.
 from __future__ import annotations
 
 import math
+import signal
 import tempfile
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import ModuleType
 from typing import Any, NamedTuple
@@ -21,7 +22,7 @@ from torch import Tensor
 
 from ctm_plugin.cameras.settings import MIN_PICTURES
 from ctm_plugin.data.readers.picture import Header
-from ctm_plugin.errors import CTMError
+from ctm_plugin.errors import CTMError, handling
 
 Reconstruction = Any
 """``pycolmap.Reconstruction``; ``pycolmap`` is imported only when it is used."""
@@ -160,6 +161,17 @@ class Workshop:
         database.close()
         return sum(count >= checking.min_num_inliers for count in inliers)
 
+    def with_headers(self, headers: Sequence[Header], lens: str, pairs: Sequence[tuple[int, int]]) -> Workshop:
+        """Copy keypoints and matches into a folder below, with these headers' lenses, by which matches are verified."""
+        copy = replace(self, folder=self.folder / "lenses")
+        copy.folder.mkdir(exist_ok=True)
+        database = require_pycolmap().Database.open(self.database)
+        places = (database.read_keypoints(number) for number in range(1, len(headers) + 1))
+        copy.store(headers, lens, (Features(each, torch.empty(0)) for each in places))
+        copy.match(pairs, lambda _: None, database.read_matches)
+        database.close()
+        return copy
+
     def reconstruct(
         self, names: Sequence[str], start: tuple[int, int, float], done: Callable[[int], None]
     ) -> Reconstruction | None:
@@ -223,7 +235,8 @@ def adjust(model: Reconstruction, threads: int, tolerance: float = 1e-6) -> None
 def require_pycolmap() -> ModuleType:
     """Import pycolmap, set to print only errors; a message names the extra that installs it."""
     try:
-        import pycolmap  # after Pillow, imported above: the zlib that its wheel shows would be taken for Pillow's
+        with handling(signal.SIG_DFL, signal.SIGTERM):  # pycolmap would print its C++ stack at SIGTERM
+            import pycolmap  # after Pillow, imported above: the zlib that its wheel shows would be taken for Pillow's
     except ImportError as error:
         raise CTMError(f"finding cameras needs pycolmap: pip install -e '.[colmap]' ({error})") from error
     pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value

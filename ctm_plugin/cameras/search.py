@@ -17,7 +17,7 @@ from torch import Tensor
 
 from ctm_plugin.cameras.colmap import CLOSER, FEWER_MATCHES, STANDARD, Features, Workshop, extract, sights
 from ctm_plugin.cameras.learned import PACKAGE, find_details, has_network, nearest_to_each_other
-from ctm_plugin.cameras.lenses import tell_lenses_apart
+from ctm_plugin.cameras.lenses import tell_lenses_apart, with_focal_length
 from ctm_plugin.cameras.pairs import VOTERS, all_pairs, likely_pairs
 from ctm_plugin.cameras.photographs import BLACK, all_black
 from ctm_plugin.cameras.refine import Light, blurred, refine
@@ -117,6 +117,14 @@ def find_cameras(
             for start in (rung.start, CLOSER)[: 2 if matched else 0]:
                 with stage("placed", len(paths)) as done:
                     model = trusted(work.reconstruct(names, start, done), work.database)
+                silent = [number for number, header in enumerate(headers, 1) if header.lens.film is None]
+                if model.placed and (focal := tell_lenses_apart(model.model, silent, settings.threads)):
+                    lengths = [f"{each:.0f}" for each in sorted({*focal.values()})]
+                    say(f"{len(lengths)} lenses without EXIF, of {', '.join(lengths)} pixels: placed again")
+                    headers = [with_focal_length(each, focal.get(number)) for number, each in enumerate(headers, 1)]
+                    work = work.with_headers(headers, settings.lens, pairs)
+                    with stage("placed", len(paths)) as done:
+                        model = trusted(work.reconstruct(names, start, done), work.database)
                 if (model.sights, model.placed) > (best.sights, best.placed):
                     best, taken = model, rung
                 if sound := best.placed >= ENOUGH_PLACED * len(paths) and not best.taken_out:
@@ -141,13 +149,9 @@ def find_cameras(
         raise DataError(
             paths[0].parent, found, f"for {MIN_PICTURES} at least, {MIN_OBSERVATIONS} such points each: {more}{hint}"
         )
-    silent = [number for number, header in enumerate(headers, 1) if header.lens.film is None]
-    model, lengths = tell_lenses_apart(best.model, silent, settings.threads)
-    if lengths:
-        say(f"{len(lengths)} lenses without EXIF, of {', '.join(f'{each:.0f}' for each in lengths)} pixels")
     with stage("refined", taken.refined[1]) as done:
-        refine(model, lights, *taken.refined, settings.threads, done)
-    return best._replace(model=model, sights=sights(model)), gain
+        refine(best.model, lights, *taken.refined, settings.threads, done)
+    return best._replace(sights=sights(best.model)), gain
 
 
 def told(trusted: Trusted, count: int) -> str:

@@ -27,12 +27,12 @@ class CamerasConfig(Settings):
         True, "search in copies that are as bright as a normal photograph; false: in the pictures as they are"
     )
     size: int = setting(
-        2000,
+        800,
         "longest side in pixels of the pictures that are searched; larger ones are shrunk by a whole number",
         least=64,
     )
     all_pairs: int = setting(
-        60,
+        40,
         "up to this many pictures, each is compared with all others; more with those that look alike and neighbours",
         least=MIN_PICTURES,
     )

@@ -4,6 +4,7 @@ import errno
 import re
 import runpy
 import shutil
+import signal
 import subprocess
 import sys
 from importlib.util import find_spec
@@ -25,6 +26,7 @@ from ctm_plugin import cli
 from ctm_plugin.cameras import command
 from ctm_plugin.cameras.colmap import FILM_DIAGONAL, focal_length
 from ctm_plugin.cameras.exposures import UNEVEN
+from ctm_plugin.cameras.lenses import with_focal_length
 from ctm_plugin.cameras.photographs import home_of, list_photographs
 from ctm_plugin.cameras.trust import Trusted
 from ctm_plugin.color.srgb import linear_to_srgb
@@ -153,6 +155,13 @@ def test_the_folder_is_read_afterwards(dark):
     assert 0 < scene.near < scene.far
     stored = iio.imread(dark / "images" / TURNED, plugin="pillow")
     np.testing.assert_array_equal(scene.train.images[scene.train.names.index("corner 4")], stored[::-1, ::-1])
+
+
+@COLMAP
+def test_sigterm_ends_without_a_stack():
+    code = "import signal; from ctm_plugin.cameras.colmap import require_pycolmap; require_pycolmap()\n"
+    done = subprocess.run([sys.executable, "-c", f"{code}signal.raise_signal(signal.SIGTERM)"], capture_output=True)
+    assert (done.returncode, done.stdout, done.stderr) == (-signal.SIGTERM, b"", b"")
 
 
 def spread_of(root: Path) -> float:
@@ -394,6 +403,8 @@ def test_the_first_focal_length_is_that_of_the_file(said, focal):
     """A picture of 40x30 has a diagonal of 50 pixels, one of 36x24 mm of 43.27 mm."""
     header = Header(30, 40, alpha=False, lens=Lens(film=said))
     assert focal_length(header) == (pytest.approx(focal), said is not None)
+    assert with_focal_length(header, None) is header
+    assert focal_length(with_focal_length(header, 33.0)) == (pytest.approx(33.0), True)
 
 
 def test_the_comparison_knows_similarities():

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from ctm_plugin.cameras import search
-from ctm_plugin.cameras.colmap import CLOSER, FEWER_MATCHES, STANDARD, Features
+from ctm_plugin.cameras.colmap import CLOSER, FEWER_MATCHES, STANDARD, Features, focal_length
 from ctm_plugin.cameras.search import find_cameras
 from ctm_plugin.cameras.settings import CamerasConfig
 from ctm_plugin.cameras.trust import Trusted
@@ -20,6 +20,7 @@ COUNT = 4
 GOOD = Trusted("good", 4, 0, 4 * 300)
 FEW, ASTRAY, NOISY = Trusted("few", 2, 0, 0), Trusted("astray", 3, 1, 3 * 300), Trusted("noisy", 4, 0, 4 * 80)
 THIN, FAIR = Trusted("thin", 4, 0, 4 * 150), Trusted("fair", 4, 0, 4 * 120)
+MIXED = Trusted("mixed", 2, 2, 0)
 HOLLOW = Trusted("hollow", 4, 0, 4 * 3)
 
 
@@ -28,13 +29,13 @@ def searched(tmp_path, monkeypatch):
     """Search where COLMAP finds canned models in turn; noted is which details and start each was asked for with."""
     monkeypatch.setattr(search, "refine", lambda model, lights, reach, rounds, threads, done: done(rounds))
     monkeypatch.setattr(search, "sights", lambda model: 7)
-    monkeypatch.setattr(search, "tell_lenses_apart", lambda model, silent, threads: (model, []))
     for name in "abcd":
         iio.imwrite(tmp_path / f"{name}.png", np.full((6, 8, 3), 9, dtype=np.uint8))
     pictures = [read_picture(path) for path in sorted(tmp_path.glob("*.png"))]
 
     def search_for(*models: Trusted, matched: int = 6, network: bool = False):
-        left, noted = list(models), []
+        left, noted, told = list(models), [], []
+        search_for.told = told
 
         class Canned:
             def __init__(self, folder: Path, threads: int, seed: int):
@@ -54,11 +55,22 @@ def searched(tmp_path, monkeypatch):
                 done(len(pairs))
                 return matched
 
+            def with_headers(self, headers, lens, pairs):
+                told.append([focal_length(header)[0] for header in headers])
+                return Canned(Path("lenses"), 1, 0)
+
             def reconstruct(self, names, start, done):
                 done(3)
                 noted.append((self.folder.name, start))
                 return left.pop(0)
 
+        monkeypatch.setattr(
+            search,
+            "tell_lenses_apart",
+            lambda model, silent, threads: (
+                dict.fromkeys(silent, 300.0) | {1: 600.0} if model == "mixed" and silent else {}
+            ),
+        )
         monkeypatch.setattr(search, "Workshop", Canned)
         monkeypatch.setattr(search, "has_network", lambda: network)
         monkeypatch.setattr(search, "find_details", lambda grey: (torch.zeros(5, 2), torch.zeros(5, 64)))
@@ -105,6 +117,14 @@ def test_thin_models_are_searched_again_with_pooled_details(searched, capsys):
     assert searched(NOISY, GOOD) == ("good", [("usual", STANDARD), ("pooled", FEWER_MATCHES)])
     assert "a mean one sees 80 points that two others see: searched again for details pooled" in capsys.readouterr().err
     assert searched(NOISY, FEW)[0] == "noisy"
+
+
+def test_pictures_of_two_lenses_are_placed_again(searched, capsys):
+    """Before the model is judged, and from the start that placed them."""
+    found, noted = searched(MIXED, GOOD)
+    assert (found, noted) == ("good", [("usual", STANDARD), ("lenses", STANDARD)])
+    assert "2 lenses without EXIF, of 300, 600 pixels: placed again\n" in capsys.readouterr().err
+    assert searched.told == [[600.0, 300.0, 300.0, 300.0]]
 
 
 @pytest.mark.parametrize(
