@@ -46,7 +46,7 @@ SETTINGS = {
     ),
     "nerf": ("backbone=nerf", "color_space=log"),
     "ngp": ("backbone=ngp", "color_space=log"),
-    "splat": ("backbone=splat", "color_space=gain", "backbone.threshold=1e-6", "backbone.per_pixel=0.375"),
+    "splat": ("backbone=splat", "color_space=gain", "backbone.threshold=1e-6", "backbone.per_pixel=0.075"),
     "barf2d": PLANAR,
     "barf2d, all pixels": (*PLANAR, "backbone.pixels=null", "color_space=lab"),
 }

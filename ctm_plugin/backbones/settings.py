@@ -279,7 +279,9 @@ class SplatConfig(Settings, section="backbone"):
         2e-4, "a Gaussian is doubled when its place in the picture has a larger gradient than this", above=0
     )
     per_pixel: float = setting(
-        0.02, "largest number of Gaussians, divided by the number of pixels of all training pictures", above=0
+        0.02,
+        "largest number of Gaussians, divided by the number of pixels of all training pictures, of 40 at least",
+        above=0,
     )
     pruned: float = setting(0.005, "Gaussians with less opacity are removed", above=0)
     reset_every: int = setting(

@@ -41,6 +41,8 @@ SPLAT_COST = 0.7
 """Cost of rendering the full number of Gaussians, where a step's pixels cost 1."""
 PARTS = 64
 """Number of equal parts in which the cost of a range of steps is summed."""
+CAP_VIEWS = 40
+"""Least number of training views that the cap of Gaussians counts: few views of a scene show as much detail as many."""
 MIN_SHARE = 0.01
 """Least part of a pixel's variance that is filled: lenses of one capture differ by less."""
 
@@ -79,7 +81,8 @@ class Splat(PictureBackbone):
         self.register_buffer("grad2d_count", torch.zeros(len(places)))
         centres = scene.train.c2w[:, :, 3]
         self.extent = max(1.1 * float((centres - centres.mean(0)).norm(dim=1).max()), 1e-6)
-        self.cap_max = max(len(places), int(config.per_pixel * len(self.pixels)))
+        pixels = max(len(self.views), CAP_VIEWS) * self.views.height * self.views.width
+        self.cap_max = max(len(places), int(config.per_pixel * pixels))
         self.pace = Pace(config.steps)
         self.side = 1
         self.cameras: dict[int, Camera] = {}

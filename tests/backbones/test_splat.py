@@ -32,7 +32,7 @@ from ctm_plugin.splats.growth import Change
 from ctm_plugin.splats.render import bends
 
 SPLAT = ("backbone=splat", "trainer.image_every=null")
-GROWS = ("backbone.threshold=1e-6", "backbone.per_pixel=0.375")
+GROWS = ("backbone.threshold=1e-6", "backbone.per_pixel=0.075")
 """By which next to all Gaussians are doubled, up to 432."""
 
 
@@ -248,6 +248,16 @@ def test_pictures_that_nothing_follows_leave_nothing_behind(scene):
         module.training_step(None, 0)["loss"].backward()
     assert len(module.shifts) == 1
     assert not make(scene).depths
+
+
+@pytest.mark.parametrize(("times", "counted"), [(1, 40), (5, 40), (6, 48)])
+def test_few_views_have_the_cap_of_forty(scene, times, counted):
+    """Of 8 views, once and repeated."""
+    train = scene.train
+    more = Views(train.images.repeat(times, 1, 1, 1), train.c2w.repeat(times, 1, 1), train.intrinsics.repeat(times, 1),
+                 tuple(map(str, range(times * len(train)))))  # fmt: skip
+    module = make(dataclasses.replace(scene, train=more), per_pixel=0.1)
+    assert module.cap_max == int(0.1 * counted * train.height * train.width)
 
 
 @pytest.fixture(scope="module")
