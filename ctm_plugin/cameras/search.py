@@ -5,7 +5,8 @@ from __future__ import annotations
 import time
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple, TypeVar
@@ -42,6 +43,8 @@ THINNING = 8
 """Spacing in rows and columns of the pixels whose mean is a picture's brightness."""
 ENOUGH_PLACED = 0.7
 """Share of the pictures with a camera below which another search is tried."""
+LARGER_SIZE = 2000
+"""Longest side in pixels of the pictures that are searched where smaller ones show too little."""
 MIN_OBSERVATIONS = 40
 """Mean number of points a picture observes that two others observe too, below which a model is refused. Measured on a
 noisy capture, not refined: cameras are off by 3 to 30 % below 40, 1.5 % at 75 to 140, 0.7 % at 280."""
@@ -79,7 +82,7 @@ def find_cameras(
     Domain-size pooling in local descriptors, CVPR 2015); then a network's, if it is installed: at once where too few
     pictures get a pose. Of several models the one with most observations is taken, and refined. Keypoints and
     matches are kept in ``folder``: those that are there already are used. Pictures far less sharp than their
-    neighbours are left out.
+    neighbours are left out. Where few get a pose, pictures of up to ``LARGER_SIZE`` are searched in the same way.
 
     Raises:
         DataError: all pictures are black, too few get a pose, or they have too few observations.
@@ -93,7 +96,9 @@ def find_cameras(
         if soft := unsharp([each.light.numpy() for each in lights], sensors):
             say(f"{len(soft)} pictures far less sharp than their neighbours are left out, as {names[soft[0]]!r}")
             kept = [number for number in range(len(names)) if number not in soft]
-            paths, headers, lights, names = ([each[i] for i in kept] for each in (paths, headers, lights, names))
+            pictures, paths, headers, lights, names = (
+                [each[i] for i in kept] for each in (pictures, paths, headers, lights, names)
+            )
         pairs = all_pairs(len(paths)) if len(paths) <= settings.all_pairs else []
         if settings.brighten:
             gain = find_gain([as_grey(each.light[::THINNING, ::THINNING]) for each in lights])
@@ -137,6 +142,14 @@ def find_cameras(
             rungs = rungs if sound else rungs[-1:]
             if rungs:
                 say(f"{told(best, len(paths))}: searched again for {rungs[0].why}")
+    shrunk = settings.size < LARGER_SIZE and any(each.scale > 1 for each in lights)
+    if shrunk and (best.placed < ENOUGH_PLACED * len(paths) or best.mean < MIN_OBSERVATIONS):
+        say(f"{told(best, len(paths))}: searched again in larger pictures")
+        (folder / "larger").mkdir(exist_ok=True)
+        with suppress(DataError):
+            there = find_cameras(pictures, names, replace(settings, size=LARGER_SIZE), folder / "larger")
+            if there[0].placed >= best.placed:
+                return there
     if best.placed < MIN_PICTURES or best.mean < MIN_OBSERVATIONS:
         mean = work.details() / len(paths)
         found = (

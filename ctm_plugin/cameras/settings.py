@@ -28,7 +28,7 @@ class CamerasConfig(Settings):
     )
     size: int = setting(
         800,
-        "longest side in pixels of the pictures that are searched; larger ones are shrunk by a whole number",
+        "longest side in pixels of the pictures that are searched, shrunk by a whole number; 2000 where few are placed",
         least=64,
     )
     all_pairs: int = setting(

@@ -119,6 +119,16 @@ def test_thin_models_are_searched_again_with_pooled_details(searched, capsys):
     assert searched(NOISY, FEW)[0] == "noisy"
 
 
+@pytest.mark.parametrize(
+    ("models", "taken"), [((FEW, FEW, FEW, FEW, GOOD), "good"), ((HOLLOW, HOLLOW, GOOD), "good"), ((GOOD,), "good")]
+)
+def test_larger_pictures_are_searched_where_few_are_placed(searched, monkeypatch, capsys, models, taken):
+    read = search.read_light
+    monkeypatch.setattr(search, "read_light", lambda picture, size: read(picture, 4 if size < 2000 else size))
+    assert searched(*models)[0] == taken
+    assert ("searched again in larger pictures" in capsys.readouterr().err) == (len(models) > 1)
+
+
 def test_pictures_of_two_lenses_are_placed_again(searched, capsys):
     """Before the model is judged, and from the start that placed them."""
     found, noted = searched(MIXED, GOOD)
