@@ -241,6 +241,7 @@ def test_colour_spaces(compose, overrides, tmp_path, space, ctm):
     assert math.isfinite(train(config, tmp_path)["warp_error"])
 
 
+@pytest.mark.slow
 def test_the_command_line(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     small = ["trainer=smoke", "backbone.steps=2", "hydra.run.dir=run"]

@@ -152,6 +152,7 @@ def test_code_for_another_processor_is_not_used(first, kept, tmp_path):
     assert outcomes == [True, True, False, False]
 
 
+@pytest.mark.slow
 def test_one_process_at_a_time_compiles_a_function(kept, tmp_path):
     """Several that write numba's files at once may leave one signature's code under the key of another."""
     locks = [*kept.rglob("weights.*.lock")]

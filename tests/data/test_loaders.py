@@ -42,6 +42,7 @@ def test_pictures_of_their_own_width(load):
     assert torch.equal(load(width="full").train.images, load().train.images)
 
 
+@pytest.mark.parametrize("layout", MAKE)
 @pytest.mark.parametrize("settings", [{"downscale": 2}, {"downscale": 1.4}, {"downscale": 3}, {"width": 5}])
 def test_any_factor_and_width(load, settings):
     whole, small = load().test, load(**settings).test

@@ -58,6 +58,7 @@ def test_patches_against_scikit_image(picture):
     torch.testing.assert_close(patch, torch.from_numpy(expected), atol=2e-5, rtol=0)
 
 
+@pytest.mark.slow
 @given(st.integers(0, 10_000))
 @settings(max_examples=25, deadline=None)
 def test_all_corners_lie_inside(seed):

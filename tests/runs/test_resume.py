@@ -257,6 +257,7 @@ def test_a_damaged_checkpoint_is_told_or_read_as_it_was(finished, whole, where, 
     assert list(differing(read["state_dict"], checkpoint(whole)["state_dict"])) == []
 
 
+@pytest.mark.slow
 def test_ctrl_c_in_a_process(arguments, tmp_path):
     """As a user does it: the signal from outside, the command that the message gives."""
     run = tmp_path / "my run"

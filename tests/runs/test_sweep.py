@@ -181,6 +181,7 @@ def test_a_failure_does_not_end_the_sweep(recorded, capsys):
     ]  # fmt: skip
 
 
+@pytest.mark.slow
 def test_going_on_runs_what_is_missing(recorded, capsys):
     assert main(["-m", "seed=0,1", "hydra.sweep.dir=s"]) == 0
     before = {path: path.stat().st_mtime_ns for path in Path("s").rglob(METRICS)}
