@@ -86,7 +86,7 @@ class Interrupted(CTMError):
 
 
 @contextmanager
-def handling(handler: Callable[[int, Any], None], *numbers: int) -> Iterator[dict[int, Any]]:
+def handling(handler: Callable[[int, Any], None] | signal.Handlers, *numbers: int) -> Iterator[dict[int, Any]]:
     """Context that calls ``handler`` on signals; it gives the previous handlers. Only the main thread meets signals."""
     main = threading.current_thread() is threading.main_thread()
     before = {number: signal.signal(number, handler) for number in numbers} if main else {}
