@@ -6,6 +6,7 @@ Only on CPUs, which is what pycolmap's wheels are made for.
 from __future__ import annotations
 
 import math
+import shutil
 import signal
 import tempfile
 from collections.abc import Callable, Iterable, Sequence
@@ -164,7 +165,8 @@ class Workshop:
     def with_headers(self, headers: Sequence[Header], lens: str, pairs: Sequence[tuple[int, int]]) -> Workshop:
         """Copy keypoints and matches into a folder below, with these headers' lenses, by which matches are verified."""
         copy = replace(self, folder=self.folder / "lenses")
-        copy.folder.mkdir(exist_ok=True)
+        shutil.rmtree(copy.folder, ignore_errors=True)  # a search that was stopped may have found other lenses
+        copy.folder.mkdir()
         database = require_pycolmap().Database.open(self.database)
         places = (database.read_keypoints(number) for number in range(1, len(headers) + 1))
         copy.store(headers, lens, (Features(each, torch.empty(0)) for each in places))

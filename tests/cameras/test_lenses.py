@@ -2,8 +2,11 @@
 
 import numpy as np
 import pytest
+import torch
 
-from ctm_plugin.cameras.lenses import lenses
+from ctm_plugin.cameras.colmap import Features, Workshop
+from ctm_plugin.cameras.lenses import lenses, with_focal_length
+from ctm_plugin.data.readers.picture import Header
 
 CHANCE = np.random.default_rng(0)
 
@@ -35,3 +38,16 @@ def test_lenses(lengths, counts):
         assert [sorted(order[group]) for group in groups] == [
             [*range(start, start + count)] for start, count in zip(np.cumsum([0, *counts]), counts, strict=False)
         ]
+
+
+def test_a_search_that_was_stopped_begins_with_its_lenses_anew(tmp_path):
+    """Another count of lenses may be found the next time."""
+    headers = [Header(30, 40, alpha=False)] * 3
+    places = np.ones((5, 4), np.float32)
+    work = Workshop(tmp_path, 1, 0)
+    work.store(headers, "PINHOLE", (Features(places, torch.empty(0)) for _ in headers))
+    for focal in ([50.0, 50.0, 50.0], [50.0, 90.0, 90.0]):
+        told = [with_focal_length(*each) for each in zip(headers, focal, strict=True)]
+        again = work.with_headers(told, "PINHOLE", [])
+        assert (again.stored(), again.details()) == (3, 15)
+    assert work.stored() == 3
