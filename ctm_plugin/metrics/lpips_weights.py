@@ -6,6 +6,7 @@ import socket
 import sys
 import zipfile
 from collections.abc import Mapping
+from functools import cache
 from http.client import HTTPException
 from pathlib import Path, PurePosixPath
 from pickle import UnpicklingError
@@ -103,8 +104,7 @@ def _download(net: Net) -> Path:
     path = Path(torch.hub.get_dir(), "checkpoints", PurePosixPath(url).name)
     if path.exists():
         return path
-    size = f"{MEGABYTES[net]} MB from {urlsplit(url).netloc}"
-    print(f"LPIPS, one of the scores, needs {size}, once; if they cannot be had, it is left out", file=sys.stderr)
+    _announce(net)
     path.parent.mkdir(parents=True, exist_ok=True)
     before = socket.getdefaulttimeout()
     socket.setdefaulttimeout(TIMEOUT_S)  # torch.hub sets none: a server that goes silent would block for ever
@@ -114,3 +114,10 @@ def _download(net: Net) -> Path:
     finally:
         socket.setdefaulttimeout(before)
     return path
+
+
+@cache
+def _announce(net: Net) -> None:
+    """Tell what is downloaded, once in a process: the demo has three runs, of which each asks for it."""
+    size = f"{MEGABYTES[net]} MB from {urlsplit(URLS[net]).netloc}"
+    print(f"LPIPS, one of the scores, needs {size}, once; if they cannot be had, it is left out", file=sys.stderr)

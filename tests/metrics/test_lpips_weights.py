@@ -132,6 +132,7 @@ def published(tmp_path, monkeypatch):
 
 
 def test_download_goes_to_the_cache_after_one_line(published, empty_hub, capsys):
+    lpips_weights._announce.cache_clear()
     torch.save(features("alex"), published("alexnet-owt.pth"))
     model, reason = load_lpips()
     assert (model.net, reason) == ("alex", "")
@@ -159,6 +160,13 @@ def test_a_download_that_cannot_be_used_is_a_reason(published, what):
     model, reason = load_lpips()
     assert model is None
     assert f"{lpips_weights.URLS['alex']}: " in reason
+
+
+def test_a_download_that_fails_twice_is_told_once(published, empty_hub, capsys):
+    lpips_weights._announce.cache_clear()
+    BROKEN["text"](published("alexnet-owt-00000000.pth"))
+    assert [load_lpips()[0] for _ in range(2)] == [None, None]
+    assert capsys.readouterr().err.count("needs 233 MB") == 1
 
 
 def test_a_server_that_never_answers_costs_only_the_timeout(monkeypatch):
