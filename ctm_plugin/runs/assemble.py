@@ -13,13 +13,14 @@ import lightning as L
 from ctm_plugin.backbones.base import Backbone
 from ctm_plugin.color.photometric import Photometric
 from ctm_plugin.color.transform import Chain, ColorTransform
+from ctm_plugin.compose.checks import checked, made, name_of, section_of, transform_of
 from ctm_plugin.data.capture import Capture
 from ctm_plugin.draws import seeded
 from ctm_plugin.errors import ConfigError, CTMError
 from ctm_plugin.loggers.base import RunLogger
+from ctm_plugin.metrics.settings import MetricsConfig
 from ctm_plugin.metrics.table import add_others
-from ctm_plugin.runs.checks import checked, made, name_of, section_of, transform_of
-from ctm_plugin.runs.settings import MetricsConfig, TrainerConfig
+from ctm_plugin.runs.settings import TrainerConfig
 from ctm_plugin.settings.build import Config
 from ctm_plugin.settings.registry import APPEARANCES, BACKBONES, CALLBACKS, COLOR_SPACES, DATASETS, LOGGERS, TRANSFORMS
 
