@@ -55,7 +55,7 @@ def assemble(
     given = checked(config, watched=run is not None)
     add_others()
     seed = config["seed"]
-    photometric = made(Photometric, given.loss)
+    photometric = made(Photometric, given["loss"])
     transform = color_transform(config, seed)
     name = name_of(config["backbone"])
     backbone = BACKBONES.get(name)
@@ -64,7 +64,7 @@ def assemble(
         raise ConfigError("appearance", shares, f"none: backbone={name} has no pictures that cameras took")
     observers = ([], [])
     if run is not None:
-        observed = [made(CALLBACKS.get(each), settings) for each, settings in given.callbacks.items()]
+        observed = [made(CALLBACKS.get(each), settings) for each, settings in given["callbacks"].items()]
         observers = (loggers(config, run, step), observed)
     scene = load_scene(config, capture) if scene is None else scene
     if not isinstance(scene, backbone.Scene):
@@ -72,12 +72,13 @@ def assemble(
         if others := " or ".join(f"backbone={each}" for each in _made_for(scene)):
             expected += f"; this one is for {others}"
         raise ConfigError("dataset", name_of(config["dataset"]), expected)
-    module = backbone(given.backbone, scene, transform, photometric, seed)
-    if given.trainer.minutes is not None and module.pace is None:
-        raise ConfigError("trainer.minutes", given.trainer.minutes, f"null: backbone={name} takes all its steps")
+    module = backbone(given["backbone"], scene, transform, photometric, seed)
+    trainer: TrainerConfig = given["trainer"]
+    if trainer.minutes is not None and module.pace is None:
+        raise ConfigError("trainer.minutes", trainer.minutes, f"null: backbone={name} takes all its steps")
     if shares != "none":
-        module.appearance = APPEARANCES.get(shares)(given.appearance, scene.train)
-    return Parts(scene, module, given.trainer, given.metrics, *observers)
+        module.appearance = APPEARANCES.get(shares)(given["appearance"], scene.train)
+    return Parts(scene, module, trainer, given["metrics"], *observers)
 
 
 def _made_for(scene: Any) -> Iterator[str]:

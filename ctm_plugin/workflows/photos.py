@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from ctm_plugin.cameras.clips import root_of, take_frames
-from ctm_plugin.cameras.photographs import PICTURE_SUFFIXES, added, below, home_of, list_photographs
+from ctm_plugin.cameras.photographs import PICTURE_SUFFIXES, added, home_and_files, list_photographs
 from ctm_plugin.cameras.raws import develop_raws
 from ctm_plugin.cameras.settings import DEFAULT_FOLDER, CamerasConfig
 from ctm_plugin.compose.compose import compose
@@ -108,7 +108,7 @@ def dry_run(folder: Path, settings: PhotosConfig, others: Sequence[str] = ()) ->
     """
     root, run, why = begun(folder, settings, others)
     if why:
-        files = [folder] if root != folder else below(home_of(root, DEFAULT_FOLDER))
+        files = [folder] if root != folder else home_and_files(root, DEFAULT_FOLDER)[1]
         kinds = {"photographs": PICTURE_SUFFIXES, "clips": CLIP_SUFFIXES}
         counts = {kind: sum(path.suffix.lower() in suffixes for path in files) for kind, suffixes in kinds.items()}
         if not any(counts.values()):
@@ -161,7 +161,7 @@ def check_writable(run: Path) -> None:
 
 def parts(root: Path, seconds: float) -> dict[str, float]:
     """Guess the seconds of each part of the command, for the progress bar over all of them."""
-    count = sum(map(is_picture, below(home_of(root, DEFAULT_FOLDER))))
+    count = sum(map(is_picture, home_and_files(root, DEFAULT_FOLDER)[1]))
     finding = {} if layouts(root) else {"brightness": 0.1, "details": 0.5, "pairs": 0.5, "placed": 0.4, "refined": 0.4}
     times = {what: count * each for what, each in finding.items()}
     return {

@@ -1,5 +1,6 @@
 """One command from photographs to lit views, on a hall that is dark."""
 
+import os
 import shlex
 import shutil
 import sys
@@ -101,7 +102,10 @@ def test_a_dry_run_without_cameras(tmp_path, monkeypatch, capsys):
     assert "capture: found no photographs and no clips" in capsys.readouterr().err
     for name in ("a.jpg", "b.HEIC", "c.mov"):
         (tmp_path / "capture" / name).write_bytes(b"x")
+    walked, walk = [], os.walk
+    monkeypatch.setattr(os, "walk", lambda folder, **more: walked.append(folder) or walk(folder, **more))
     assert main(["photos", "capture", "-c", "job", "minutes=3"]) == 0
+    assert walked == [Path("capture")]  # once
     assert capsys.readouterr().out.splitlines() == [
         "cameras: none found; COLMAP would search for them in 2 photographs and 1 clips",
         "then width and budget would be chosen for minutes=3",
