@@ -20,9 +20,9 @@ import torch
 from turns import Turns, answer
 
 from ctm_plugin.backbones.barf2d import BARF2D
+from ctm_plugin.compose.compose import compose
 from ctm_plugin.cpu.allocator import keep_memory
 from ctm_plugin.runs.assemble import assemble
-from ctm_plugin.runs.compose import compose
 
 
 def our_module(args: argparse.Namespace) -> BARF2D:

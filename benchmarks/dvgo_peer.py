@@ -27,12 +27,12 @@ from turns import Turns, answer, view_psnr
 
 from ctm_plugin.backbones.dvgo import DVGO
 from ctm_plugin.backbones.voxels import VoxelField
+from ctm_plugin.compose.compose import compose
 from ctm_plugin.cpu.allocator import keep_memory
 from ctm_plugin.draws import Draws
 from ctm_plugin.rays.cameras import Rays
 from ctm_plugin.rays.grid import as_volume
 from ctm_plugin.runs.assemble import assemble
-from ctm_plugin.runs.compose import compose
 from ctm_plugin.runs.settings import TrainerConfig
 from ctm_plugin.scene.views import composite
 

@@ -20,9 +20,9 @@ from turns import Turns, answer, view_psnr
 
 from ctm_plugin.backbones.nerf import NeRF
 from ctm_plugin.backbones.nerf_field import NeRFField
+from ctm_plugin.compose.compose import compose
 from ctm_plugin.cpu.allocator import keep_memory
 from ctm_plugin.runs.assemble import assemble
-from ctm_plugin.runs.compose import compose
 
 
 def our_module(args: argparse.Namespace) -> NeRF:

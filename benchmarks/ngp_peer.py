@@ -21,10 +21,10 @@ import torch
 from turns import SIDES, Turns, answer, view_psnr
 
 from ctm_plugin.backbones.ngp import NGP
+from ctm_plugin.compose.compose import compose
 from ctm_plugin.cpu.allocator import keep_memory
 from ctm_plugin.rays.cameras import Rays
 from ctm_plugin.runs.assemble import assemble
-from ctm_plugin.runs.compose import compose
 from ctm_plugin.runs.settings import TrainerConfig
 from ctm_plugin.scene.frustum import frustum_box
 

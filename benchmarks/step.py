@@ -36,11 +36,11 @@ from torch.profiler import ProfilerActivity, profile, record_function
 from ctm_plugin.backbones.base import Backbone
 from ctm_plugin.callbacks.stopwatch import peak_memory_mb, synchronise
 from ctm_plugin.color.transform import ColorTransform, fitted
+from ctm_plugin.compose.compose import compose, explain
 from ctm_plugin.cpu.allocator import keep_memory
 from ctm_plugin.cpu.products import fast_products
 from ctm_plugin.errors import ConfigError, CTMError
 from ctm_plugin.runs.assemble import Parts, assemble, color_transform
-from ctm_plugin.runs.compose import compose, explain
 from ctm_plugin.settings.build import build, pairs
 from ctm_plugin.settings.setting import setting
 from ctm_plugin.show.console import quieten

@@ -11,9 +11,9 @@ import lightning as L
 import torch
 from torch import Tensor
 
+from ctm_plugin.compose.compose import compose
 from ctm_plugin.draws import Draws
 from ctm_plugin.runs.assemble import assemble
-from ctm_plugin.runs.compose import compose
 
 PAIRS = 20000
 

@@ -27,10 +27,8 @@ from omegaconf.errors import OmegaConfBaseException
 from rich.console import Console
 
 from ctm_plugin import __version__
-from ctm_plugin.cpu.threads import let_waiting_threads_sleep
-from ctm_plugin.errors import ConfigError, CTMError, Interrupted
-from ctm_plugin.runs.choices import register, told, with_fitting_dataset
-from ctm_plugin.runs.compose import (
+from ctm_plugin.compose.choices import register, told, with_fitting_dataset
+from ctm_plugin.compose.compose import (
     GROUPS,
     at_work,
     check,
@@ -42,6 +40,8 @@ from ctm_plugin.runs.compose import (
     prepared,
     without_hydras,
 )
+from ctm_plugin.cpu.threads import let_waiting_threads_sleep
+from ctm_plugin.errors import ConfigError, CTMError, Interrupted
 from ctm_plugin.settings import commands
 from ctm_plugin.settings.as_typed import is_sweep
 from ctm_plugin.settings.build import SECTIONS, unknown_key
@@ -60,9 +60,9 @@ MAIN_GROUPS = ("dataset", "backbone", "ctm", "trainer")
 
 def run(config: DictConfig) -> float | None:
     """Run one job, single or of a sweep; returns its PSNR, for sweepers that search, and raises what the job raises."""
+    from ctm_plugin.compose.decide import decide
     from ctm_plugin.cpu.allocator import give_back
-    from ctm_plugin.runs.decide import decide
-    from ctm_plugin.runs.processes import is_main_process
+    from ctm_plugin.files import is_main_process
     from ctm_plugin.runs.rundir import ERROR, LAST, new_folder
     from ctm_plugin.runs.sweep import go_on
     from ctm_plugin.runs.train import train
@@ -117,7 +117,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         with _a_line_each():
             _run(arguments)
     except (KeyboardInterrupt, Interrupted) as stop:
-        from ctm_plugin.runs.processes import is_main_process
+        from ctm_plugin.files import is_main_process
 
         if is_main_process():  # of several, one tells it
             print(str(stop) or "stopped", file=sys.stderr)
@@ -236,7 +236,7 @@ def _train(arguments: Sequence[str]) -> None:
 
 def _print_one(own: Hydra, config: DictConfig, flags: Namespace) -> None:
     """Print a configuration as Hydra's ``--cfg`` does, but with the values that the program decides."""
-    from ctm_plugin.runs.decide import decide
+    from ctm_plugin.compose.decide import decide
 
     decide(config)
     HydraConfig.instance().set_config(config)

@@ -1,4 +1,4 @@
-"""Writing files so that a reader sees a whole one or none."""
+"""Writing files so that a reader sees a whole one or none, from one process of several."""
 
 from __future__ import annotations
 
@@ -10,6 +10,11 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
+
+
+def is_main_process() -> bool:
+    """Tell whether this process writes the run's files: the only one, or the first of several."""
+    return all(os.environ.get(name, "0") == "0" for name in ("RANK", "LOCAL_RANK", "SLURM_PROCID"))
 
 
 @contextmanager

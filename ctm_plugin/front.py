@@ -11,15 +11,18 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.optim import Optimizer
 
+from ctm_plugin.backbones.splat import Splat
 from ctm_plugin.color.photometric import Photometric
 from ctm_plugin.color.prepare import adam_of, prepare
 from ctm_plugin.color.transform import ColorTransform
+from ctm_plugin.compose.compose import compose, conf_dir, explain
 from ctm_plugin.errors import ConfigError, CTMError
+from ctm_plugin.export.splats import TRAIN_STEPS, plain
 from ctm_plugin.runs.assemble import color_transform
-from ctm_plugin.runs.compose import compose, conf_dir, explain
 from ctm_plugin.runs.load import LoadedRun, load_posed
 from ctm_plugin.settings.listing import names
 from ctm_plugin.settings.registry import COLOR_SPACES
+from ctm_plugin.splats.gaussians import Gaussians
 
 KEY_PREFIXES = ("ctm.", "color_space.", "color_space=")
 """Prefixes of the keys that :func:`transform` takes."""
@@ -100,13 +103,27 @@ def losses(
         return transform.losses([latent.float()], rgb.float(), photometric, uniform).terms
 
 
-def load_run(run: str | Path) -> LoadedRun:
+class Run(LoadedRun):
+    """A finished run, for other programs."""
+
+    def gaussians(self) -> Gaussians:
+        """The run's Gaussians in lit sRGB and the world of its files, as ``ctm export`` writes them.
+
+        Raises:
+            CTMError: the run has no Gaussians.
+        """
+        if not isinstance(self.module, Splat):
+            raise CTMError(f"found a run of {type(self.module).__name__}, expected one of splats")
+        return plain(self.module, self.light, TRAIN_STEPS)
+
+
+def load_run(run: str | Path) -> Run:
     """Read a run of a scene with cameras, from its directory or its checkpoint's last state.
 
     Returns:
-        Its ``light``, ``render(c2w, intrinsics, width, height)`` and ``gaussians()``, see :class:`~.load.Run`.
+        Its ``light``, ``render(c2w, intrinsics, width, height)`` and ``gaussians()``, see :class:`Run`.
 
     Raises:
         CTMError: the folder is no such run, or it cannot be read.
     """
-    return load_posed(Path(run), pictures=False)
+    return Run(**vars(load_posed(Path(run), pictures=False)))

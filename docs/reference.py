@@ -21,10 +21,10 @@ from mkdocs.structure.files import File, Files
 sys.path.append(str(Path(__file__).resolve().parent / "examples" / "ctm_scenes"))
 from ctm_scenes.settings import VERB
 
+from ctm_plugin.compose import choices
+from ctm_plugin.compose.compose import GROUPS, conf_dir
 from ctm_plugin.data.settings import FolderConfig
 from ctm_plugin.metrics.table import METRICS
-from ctm_plugin.runs import choices
-from ctm_plugin.runs.compose import GROUPS, conf_dir
 from ctm_plugin.settings import commands, listing
 from ctm_plugin.settings.registry import REGISTRIES
 

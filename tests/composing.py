@@ -1,17 +1,18 @@
-"""Hydra composes the same in less than half the time: what it would ask, copy, read or parse twice, it does once.
+"""Hydra composes the same in two thirds of the time: what it would ask, copy or read twice, it does once.
 
-Most tests of the command line, and every command of the documentation, are little else than a composition.
+Most tests of the command line, and every command of the documentation, are little else than a composition: 142 ms, and
+208 without this. ``test_conf``, ``test_cli``, ``test_mistakes``, ``compose`` and ``settings`` take 82 s of a processor,
+and 116 without this; nearly all of their compositions differ, so that sharing them gains nothing.
 """
 
 import copy
-import functools
 from collections.abc import Sequence
 from typing import Any
 
 import pytest
 from hydra._internal import defaults_list
 from hydra._internal.config_repository import CachingConfigRepository
-from omegaconf import _utils, base, grammar_parser
+from omegaconf import _utils
 from yaml.constructor import SafeConstructor
 from yaml.resolver import Resolver
 
@@ -25,7 +26,6 @@ def quicken(patch: pytest.MonkeyPatch) -> None:
     """Replace what is done twice for as long as ``patch`` lasts."""
     patch.setattr(CachingConfigRepository, "__init__", share)
     patch.setattr(defaults_list, "_create_interpolation_map", remembered(defaults_list._create_interpolation_map))
-    patch.setattr(base, "parse", functools.lru_cache(maxsize=None)(grammar_parser.parse))
     if CParser is not None:
         loader = quick_loader(_utils.get_yaml_loader())
         patch.setattr(_utils, "get_yaml_loader", lambda: loader)

@@ -14,7 +14,7 @@ from ctm_plugin import cli
 
 PRELOAD = (
     "ctm_plugin.backbones.dvgo", "ctm_plugin.cli", "ctm_plugin.data.colmap", "ctm_plugin.data.planar",
-    "ctm_plugin.data.rawnerf", "ctm_plugin.data.transforms", "ctm_plugin.runs.video", "ctm_plugin.report.pairs",
+    "ctm_plugin.data.rawnerf", "ctm_plugin.data.transforms", "ctm_plugin.export.video", "ctm_plugin.report.pairs",
     "ctm_plugin.report.page", "ctm_plugin.runs.train", "rawpy",
     *(["reordered"] if "CTM_REORDERED" in os.environ else []),
 )  # fmt: skip

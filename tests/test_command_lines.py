@@ -28,14 +28,15 @@ from pages import PAGES, ROOT
 from tensorboard.program import TensorBoard
 
 from ctm_plugin import cli
+from ctm_plugin.compose.compose import GROUPS, compose, conf_dir
 from ctm_plugin.cpu import allocator
-from ctm_plugin.runs import assemble, demo, rundir, sweep, train
-from ctm_plugin.runs.compose import GROUPS, compose, conf_dir
+from ctm_plugin.runs import assemble, rundir, sweep, train
 from ctm_plugin.settings import listing, registry
 from ctm_plugin.settings.commands import VERBS as OURS
 from ctm_plugin.settings.commands import VERBS_OF_OTHERS
 from ctm_plugin.settings.registry import load
 from ctm_plugin.settings.setting import keys
+from ctm_plugin.workflows import demo
 
 GUIDES = ("index", "photographs", "refused", "colours", "concepts", "paper", "plug_in", "planar", "scenes", "cluster")
 TYPED = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs" / f"{name}.md" for name in GUIDES)]

@@ -1,4 +1,4 @@
-"""Folders are there whole, or as they were."""
+"""Folders are there whole, or as they were; one process writes them."""
 
 import errno
 import os
@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from ctm_plugin.files import replacing_folder, write_text
+from ctm_plugin.files import is_main_process, replacing_folder, write_text
 
 
 def test_a_new_folder(tmp_path):
@@ -74,3 +74,10 @@ def test_a_disk_that_may_only_be_read_is_told_by_the_file(tmp_path, monkeypatch)
     with pytest.raises(OSError, match="Read-only") as told:
         write_text(tmp_path / "a.txt", "text")
     assert told.value.filename == str(tmp_path / "a.txt")
+
+
+def test_the_environment_says_which_process_writes(monkeypatch):
+    assert is_main_process()
+    for name, number, main in (("LOCAL_RANK", "0", True), ("RANK", "1", False)):
+        monkeypatch.setenv(name, number)
+        assert is_main_process() == main

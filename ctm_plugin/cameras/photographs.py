@@ -44,18 +44,27 @@ def home_of(root: Path, name: str) -> Path:
     """The folder of the photographs in ``root``: that called ``name``; if ``name`` is the default and missing, the only
     folder with photographs, else ``root``.
     """
+    return home_and_files(root, name)[0]
+
+
+def home_and_files(root: Path, name: str) -> tuple[Path, list[Path]]:
+    """The folder of the photographs in ``root``, see :func:`home_of`, and all files :func:`below` it, in one walk."""
     place = root / name
-    elsewhere = name == DEFAULT_FOLDER and not place.is_dir()
-    homes = [path.parent for path in below(root) if path.suffix.lower() in PICTURE_SUFFIXES] if elsewhere else []
-    return Path(root, *Path(os.path.commonpath(homes)).relative_to(root).parts[:1]) if homes else place
+    if name != DEFAULT_FOLDER or place.is_dir():
+        return place, below(place)
+    files = below(root)
+    homes = [path.parent for path in files if path.suffix.lower() in PICTURE_SUFFIXES]
+    if not homes:
+        return place, []
+    home = Path(root, *Path(os.path.commonpath(homes)).relative_to(root).parts[:1])
+    return home, [path for path in files if path.is_relative_to(home)]
 
 
 def list_photographs(root: Path, name: str) -> list[Path]:
     """List the pictures in the photographs' folder and below, in natural order, without those of :func:`left_out`.
 
     Raises a DataError for fewer than ``MIN_PICTURES``."""
-    place = home_of(root, name)
-    files = below(place)
+    place, files = home_and_files(root, name)
     paths = [path for path in files if is_picture(path)]
     for what, others in left_out(paths).items():
         warnings.warn(f"{place}: {len(others)} {what} are left out, as {others[0].name!r}", stacklevel=2)
@@ -71,8 +80,10 @@ def list_photographs(root: Path, name: str) -> list[Path]:
 
 def added(root: Path, name: str) -> list[str]:
     """List the photographs that were added after ``ctm cameras`` searched for the cameras of ``root``."""
-    there, home = searched_in(root / MODEL_FOLDER), home_of(root, name)
-    names = [path.relative_to(home).as_posix() for path in list_photographs(root, name)] if there else []
+    if not (there := searched_in(root / MODEL_FOLDER)):
+        return []
+    home = home_of(root, name)
+    names = [path.relative_to(home).as_posix() for path in list_photographs(root, name)]
     return [each for each in names if each not in there]
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from collections import defaultdict
 from collections.abc import Mapping
+from itertools import chain
 from pathlib import Path
 from statistics import median_low
 
@@ -16,7 +17,7 @@ from ctm_plugin.cameras.photographs import below
 from ctm_plugin.data.readers.deep import write_tiff
 from ctm_plugin.data.readers.folders import RAW_SUFFIXES
 from ctm_plugin.data.readers.hot_pixels import hot_pixels
-from ctm_plugin.data.readers.images import read_picture
+from ctm_plugin.data.readers.images import read_image
 from ctm_plugin.data.readers.raw import RawHeader, open_raw, read_mosaic, read_raw
 from ctm_plugin.errors import DataError
 from ctm_plugin.files import replacing
@@ -95,9 +96,9 @@ def find_hot(headers: Mapping[Path, RawHeader]) -> dict[tuple[object, ...], Bool
     hot = {}
     for sensor, paths in sensors.items():
         chosen = paths[:: -(-len(paths) // MOST_OF_A_SENSOR)]
-        mosaics = map(read_mosaic, chosen)
-        usual = len(chosen) >= LEAST_OF_A_SENSOR and read_mosaic(chosen[0]) is not None
-        hot[sensor] = hot_pixels(mosaics) if usual else None
+        mosaics = map(read_mosaic, chosen if len(chosen) >= LEAST_OF_A_SENSOR else ())
+        first = next(mosaics, None)
+        hot[sensor] = None if first is None else hot_pixels(chain([first], mosaics))
     return hot
 
 
@@ -108,7 +109,7 @@ def _develop(
     def decode(path: Path) -> object:
         return open_raw(path, brightness, balance, max(header.sensor) > HALF_SIZE_SIDE, hot)
 
-    codes = read_picture(path, decode).image().numpy()
+    codes = read_image(path, decode).numpy()
     target.parent.mkdir(exist_ok=True)
     with replacing(target) as beside:
         write_tiff(beside, (codes * 65535).round().astype(np.uint16), header.orientation, header.lens)

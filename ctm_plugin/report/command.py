@@ -8,9 +8,9 @@ from pathlib import Path
 from ctm_plugin.errors import CTMError
 from ctm_plugin.files import replacing
 from ctm_plugin.report.labels import find_runs
+from ctm_plugin.report.settings import ReportConfig
 from ctm_plugin.report.tables import choose
 from ctm_plugin.report.text import FORMATS
-from ctm_plugin.runs.settings import ReportConfig
 
 
 def report(*runs: Path, settings: ReportConfig) -> None:

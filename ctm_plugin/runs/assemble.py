@@ -13,13 +13,14 @@ import lightning as L
 from ctm_plugin.backbones.base import Backbone
 from ctm_plugin.color.photometric import Photometric
 from ctm_plugin.color.transform import Chain, ColorTransform
+from ctm_plugin.compose.checks import checked, made, name_of, section_of, transform_of
 from ctm_plugin.data.capture import Capture
 from ctm_plugin.draws import seeded
 from ctm_plugin.errors import ConfigError, CTMError
 from ctm_plugin.loggers.base import RunLogger
+from ctm_plugin.metrics.settings import MetricsConfig
 from ctm_plugin.metrics.table import add_others
-from ctm_plugin.runs.checks import checked, made, name_of, section_of, transform_of
-from ctm_plugin.runs.settings import MetricsConfig, TrainerConfig
+from ctm_plugin.runs.settings import TrainerConfig
 from ctm_plugin.settings.build import Config
 from ctm_plugin.settings.registry import APPEARANCES, BACKBONES, CALLBACKS, COLOR_SPACES, DATASETS, LOGGERS, TRANSFORMS
 
@@ -54,7 +55,7 @@ def assemble(
     given = checked(config, watched=run is not None)
     add_others()
     seed = config["seed"]
-    photometric = made(Photometric, given.loss)
+    photometric = made(Photometric, given["loss"])
     transform = color_transform(config, seed)
     name = name_of(config["backbone"])
     backbone = BACKBONES.get(name)
@@ -63,7 +64,7 @@ def assemble(
         raise ConfigError("appearance", shares, f"none: backbone={name} has no pictures that cameras took")
     observers = ([], [])
     if run is not None:
-        observed = [made(CALLBACKS.get(each), settings) for each, settings in given.callbacks.items()]
+        observed = [made(CALLBACKS.get(each), settings) for each, settings in given["callbacks"].items()]
         observers = (loggers(config, run, step), observed)
     scene = load_scene(config, capture) if scene is None else scene
     if not isinstance(scene, backbone.Scene):
@@ -71,12 +72,13 @@ def assemble(
         if others := " or ".join(f"backbone={each}" for each in _made_for(scene)):
             expected += f"; this one is for {others}"
         raise ConfigError("dataset", name_of(config["dataset"]), expected)
-    module = backbone(given.backbone, scene, transform, photometric, seed)
-    if given.trainer.minutes is not None and module.pace is None:
-        raise ConfigError("trainer.minutes", given.trainer.minutes, f"null: backbone={name} takes all its steps")
+    module = backbone(given["backbone"], scene, transform, photometric, seed)
+    trainer: TrainerConfig = given["trainer"]
+    if trainer.minutes is not None and module.pace is None:
+        raise ConfigError("trainer.minutes", trainer.minutes, f"null: backbone={name} takes all its steps")
     if shares != "none":
-        module.appearance = APPEARANCES.get(shares)(given.appearance, scene.train)
-    return Parts(scene, module, given.trainer, given.metrics, *observers)
+        module.appearance = APPEARANCES.get(shares)(given["appearance"], scene.train)
+    return Parts(scene, module, trainer, given["metrics"], *observers)
 
 
 def _made_for(scene: Any) -> Iterator[str]:

@@ -9,8 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from ctm_plugin.errors import CheckpointError, ConfigError
-from ctm_plugin.files import write_json
-from ctm_plugin.runs.processes import is_main_process
+from ctm_plugin.files import is_main_process, write_json
 from ctm_plugin.runs.provenance import fingerprints
 from ctm_plugin.runs.rundir import differences, read_json
 from ctm_plugin.settings.build import Config

@@ -18,7 +18,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ctm_plugin.backbones.base import Backbone
-from ctm_plugin.backbones.splat import Splat
 from ctm_plugin.color.light import Light
 from ctm_plugin.cpu.allocator import keep_memory
 from ctm_plugin.errors import CheckpointError, CTMError
@@ -28,12 +27,10 @@ from ctm_plugin.runs.assemble import Parts, assemble
 from ctm_plugin.runs.cameras import CAMERAS_FILE, noted_scene
 from ctm_plugin.runs.data import check_data, located, note_data
 from ctm_plugin.runs.rundir import CONFIG, DAMAGED, LAST, PREVIOUS, differences, load_config, locked
-from ctm_plugin.runs.splats import TRAIN_STEPS, plain
 from ctm_plugin.scene.poses import IDENTITY
 from ctm_plugin.scene.views import Views
 from ctm_plugin.settings.build import Config
 from ctm_plugin.show.pictures import depth_picture, latent_picture
-from ctm_plugin.splats.gaussians import Gaussians
 
 VIEW_KINDS = ("lit", "rgb", "latent", "depth")
 """Kinds of pictures that a view is rendered as."""
@@ -88,16 +85,6 @@ class LoadedRun:
         with full_float32(self.module.device):
             view = self.module.render_view(views, 0)
         return self.picture({name: value.float().cpu() for name, value in view.items()}, kind)
-
-    def gaussians(self) -> Gaussians:
-        """The run's Gaussians in lit sRGB and the world of its files, as ``ctm export`` writes them.
-
-        Raises:
-            CTMError: the run has no Gaussians.
-        """
-        if not isinstance(self.module, Splat):
-            raise CTMError(f"found a run of {type(self.module).__name__}, expected one of splats")
-        return plain(self.module, self.light, TRAIN_STEPS)
 
     def picture(self, view: dict[str, Tensor], kind: str, light: Light | None = None) -> Float[Tensor, "h w 3"]:
         """Make a picture of one of :data:`VIEW_KINDS` out of a :meth:`PosedBackbone.render_view` result, on the CPU.

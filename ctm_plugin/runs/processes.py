@@ -17,11 +17,6 @@ GRACE_S = 10.0
 """Seconds that other processes may take to end after one has failed."""
 
 
-def is_main_process() -> bool:
-    """Tell whether this process writes the run's files: the only one, or the first of several."""
-    return all(os.environ.get(name, "0") == "0" for name in ("RANK", "LOCAL_RANK", "SLURM_PROCID"))
-
-
 @contextmanager
 def processes(run: Path, count: int) -> Iterator[None]:
     """Start the other processes of a run on this machine, and end them with it.

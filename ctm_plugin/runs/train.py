@@ -25,13 +25,13 @@ from ctm_plugin.cpu.products import fast_products
 from ctm_plugin.cpu.threads import operators_on_one_thread, warn_of_neighbours
 from ctm_plugin.data.capture import Capture
 from ctm_plugin.errors import CheckpointError, CTMError, Interrupted
-from ctm_plugin.files import naming
+from ctm_plugin.files import is_main_process, naming
 from ctm_plugin.runs.assemble import Parts, assemble
 from ctm_plugin.runs.cameras import note_cameras
 from ctm_plugin.runs.data import DATA_FILE, check_data, located, note_data
 from ctm_plugin.runs.evaluate import lpips_for, score
 from ctm_plugin.runs.load import go_back, load_checkpoint, restore
-from ctm_plugin.runs.processes import is_main_process, processes
+from ctm_plugin.runs.processes import processes
 from ctm_plugin.runs.provenance import code_version
 from ctm_plugin.runs.rundir import (
     CONFIG,

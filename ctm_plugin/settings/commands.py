@@ -90,9 +90,9 @@ class Verb(NamedTuple):
 
 VERBS = {
     "photos": Verb(
-        "make lit views and a film of photographs or clips", "FOLDER", "ctm_plugin.runs.photos:photos",
-        "ctm_plugin.runs.settings:PhotosConfig", TRAINING, ("dataset=colmap", "dataset.root=."), True,
-        "ctm_plugin.runs.photos:dry_run",
+        "make lit views and a film of photographs or clips", "FOLDER", "ctm_plugin.workflows.photos:photos",
+        "ctm_plugin.workflows.settings:PhotosConfig", TRAINING, ("dataset=colmap", "dataset.root=."), True,
+        "ctm_plugin.workflows.photos:dry_run",
     ),
     "train": Verb("train one run, or with -m a sweep; the word train may be left out"),
     "resume": Verb(
@@ -104,26 +104,27 @@ VERBS = {
         "ctm_plugin.runs.settings:LitConfig",
     ),
     "render": Verb(
-        "render a lit film of a run", "RUN_DIR", "ctm_plugin.runs.video:render", "ctm_plugin.runs.settings:VideoConfig"
+        "render a lit film of a run", "RUN_DIR", "ctm_plugin.export.video:render",
+        "ctm_plugin.export.settings:VideoConfig",
     ),
     "export": Verb(
         "write a run's splats, points, mesh or cameras for other programs", "RUN_DIR",
-        "ctm_plugin.runs.export:export", "ctm_plugin.runs.settings:ExportConfig",
+        "ctm_plugin.export.export:export", "ctm_plugin.export.settings:ExportConfig",
     ),
     "view": Verb(
         "look around in runs in the browser", "RUN_DIR ...", "ctm_plugin.view.command:view",
-        "ctm_plugin.runs.settings:ViewConfig",
+        "ctm_plugin.view.settings:ViewConfig",
     ),
     "report": Verb(
         "make tables of finished runs, with the paper's values", "RUNS ...",
-        "ctm_plugin.report.command:report", "ctm_plugin.runs.settings:ReportConfig",
+        "ctm_plugin.report.command:report", "ctm_plugin.report.settings:ReportConfig",
     ),
     "list": Verb(
         "list the choices of all groups, or the keys of GROUP or GROUP=CHOICE", "[GROUP...]",
         "ctm_plugin.cli:print_list", others=TRAINING,
     ),
     "demo": Verb(
-        "train the dark still life without CTM and with it, and compare", "", "ctm_plugin.runs.demo:demo",
+        "train the dark still life without CTM and with it, and compare", "", "ctm_plugin.workflows.demo:demo",
         others=TRAINING,
     ),
     "cameras": Verb(

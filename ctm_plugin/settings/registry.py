@@ -200,7 +200,7 @@ REGISTRIES = {
 PRESET_SETTINGS = {
     "loss": "ctm_plugin.color.settings:LossConfig",
     "trainer": "ctm_plugin.runs.settings:TrainerConfig",
-    "metrics": "ctm_plugin.runs.settings:MetricsConfig",
+    "metrics": "ctm_plugin.metrics.settings:MetricsConfig",
 }
 """Dataclasses of the groups whose choices differ only in values."""
 NOTHING = "ctm_plugin.settings.setting:Nothing"

@@ -7,7 +7,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from ctm_plugin.errors import CTMError, held_interrupt
-from ctm_plugin.runs.settings import ViewConfig
+from ctm_plugin.view.settings import ViewConfig
 
 
 def view(*runs: Path, settings: ViewConfig) -> None:

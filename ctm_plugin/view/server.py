@@ -18,9 +18,9 @@ from websockets.asyncio import server
 from ctm_plugin.color.light import chosen_light
 from ctm_plugin.cpu.products import fast_products
 from ctm_plugin.errors import ConfigError, CTMError
-from ctm_plugin.runs.settings import ViewConfig
 from ctm_plugin.view.page import Page
 from ctm_plugin.view.painter import MIN_SIDE, Look, Painter, Renderings, Viewpoint
+from ctm_plugin.view.settings import ViewConfig
 from ctm_plugin.view.sources import Subject, photographs
 
 POLL_S = 2.0

@@ -18,12 +18,12 @@ from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
+from ctm_plugin.compose.compose import compose
 from ctm_plugin.errors import CTMError, DataError
 from ctm_plugin.files import write_text
 from ctm_plugin.metrics.table import METRICS
 from ctm_plugin.report.labels import UNNAMED_VALUES
 from ctm_plugin.report.runs import Run, preset_of, read_runs
-from ctm_plugin.runs.compose import compose
 from ctm_plugin.settings.listing import leaves
 
 SETTING_COLUMNS = ("scene", "light", "backbone", "colours", "variant", "geometry", "background", "budget", "size")

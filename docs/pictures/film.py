@@ -12,8 +12,8 @@ from PIL import Image, ImageDraw, ImageFont
 
 from ctm_plugin.cpu.products import fast_products
 from ctm_plugin.data.readers.images import to_8_bits
+from ctm_plugin.export.video import encoded, rendered
 from ctm_plugin.runs.load import load_posed
-from ctm_plugin.runs.video import encoded, rendered
 from ctm_plugin.scene.camera_paths import looked_at, mean_up
 from ctm_plugin.scene.views import Views
 

@@ -8,10 +8,10 @@ import torch
 from ctm_plugin.appearance.exposure import Exposure
 from ctm_plugin.color.light import find_light
 from ctm_plugin.color.srgb import linear_to_srgb, srgb_to_linear
+from ctm_plugin.compose.compose import compose as composed_anew
 from ctm_plugin.draws import Draws
 from ctm_plugin.errors import ConfigError
 from ctm_plugin.runs.assemble import assemble
-from ctm_plugin.runs.compose import compose as composed_anew
 from ctm_plugin.runs.train import warn_of_exposures
 from ctm_plugin.settings.registry import APPEARANCES
 

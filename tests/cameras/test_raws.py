@@ -12,6 +12,7 @@ from ctm_plugin.cameras.raws import develop_raws
 from ctm_plugin.color.srgb import linear_to_srgb, srgb_to_linear
 from ctm_plugin.data.readers.images import read_image, read_picture
 from ctm_plugin.data.readers.picture import Lens
+from ctm_plugin.data.readers.raw import read_mosaic
 from ctm_plugin.errors import CTMError, DataError
 
 COLOR = np.array([0.06, 0.12, 0.05])
@@ -40,7 +41,9 @@ def test_all_have_the_light_of_the_longest(night, capsys):
         assert (header.deep, header.orientation, header.height, header.width) == (True, 6, 48, 32)
 
 
-def test_hot_pixels_are_repaired(tmp_path, capsys):
+def test_hot_pixels_are_repaired(tmp_path, monkeypatch, capsys):
+    decoded = []
+    monkeypatch.setattr("ctm_plugin.cameras.raws.read_mosaic", lambda path: decoded.append(path) or read_mosaic(path))
     for number in range(6):
         sensor = np.random.default_rng(number).normal(0.02, 0.004, (48, 64, 3))
         sensor[20, 30] = 0.5
@@ -50,6 +53,7 @@ def test_hot_pixels_are_repaired(tmp_path, capsys):
     assert capsys.readouterr().out.startswith(said)
     for path in (tmp_path / "developed").iterdir():
         assert srgb_to_linear(read_image(path)).max() < 0.1
+    assert sorted(decoded) == sorted(tmp_path.glob("*.dng"))  # each once
 
 
 def test_the_lens_is_told(tmp_path):

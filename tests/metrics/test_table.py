@@ -20,9 +20,9 @@ from ctm_plugin.report.labels import Found
 from ctm_plugin.report.runs import Run
 from ctm_plugin.report.tables import all_runs
 from ctm_plugin.report.text import FORMATS
-from ctm_plugin.runs import demo
 from ctm_plugin.show.console import print_line, print_summary, print_sweep
 from ctm_plugin.show.snapshot import compared
+from ctm_plugin.workflows import demo
 
 NEW = Metric(
     label="contrast", about="the spread of levels | of a view", higher=False, unit="levels", decimals=1, told=PLACES,

@@ -16,7 +16,7 @@ from forked import Command
 
 from ctm_plugin.errors import CTMError
 from ctm_plugin.runs import processes as distributed
-from ctm_plugin.runs.processes import is_main_process, processes
+from ctm_plugin.runs.processes import processes
 from ctm_plugin.runs.rundir import LAST, METRICS
 from ctm_plugin.runs.train import train
 
@@ -124,13 +124,6 @@ def test_ctrl_c_in_one_process_stops_both_in_the_same_step(arguments, tmp_path):
     assert error.count("stopped after step") == 1
     assert error.splitlines()[-1].startswith(f"stopped after step {saved['global_step']}; go on with: ")
     assert saved["batches_seen"] == 2 * saved["global_step"]
-
-
-def test_the_environment_says_which_process_writes(monkeypatch):
-    assert is_main_process()
-    for name, number, main in (("LOCAL_RANK", "0", True), ("RANK", "1", False)):
-        monkeypatch.setenv(name, number)
-        assert is_main_process() == main
 
 
 def test_the_failure_of_another_process_is_told(tmp_path, capfd, monkeypatch):

@@ -44,7 +44,7 @@ def made(run: Path, out: str) -> dict[str, bytes]:
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_same_files_with_and_without_photographs(ball, tmp_path, monkeypatch, capsys, kind):
-    monkeypatch.setattr("ctm_plugin.runs.splats.TRAIN_STEPS", 3)
+    monkeypatch.setattr("ctm_plugin.export.splats.TRAIN_STEPS", 3)
     shutil.copytree(ball, tmp_path / "ball")
     run = tmp_path / kind
     data = ("dataset=blender", f"dataset.root={tmp_path / 'ball'}", "dataset.exposure=0.05")

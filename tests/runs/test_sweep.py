@@ -19,11 +19,11 @@ from hydra.core.utils import JobReturn, JobStatus
 from omegaconf import OmegaConf
 
 from ctm_plugin.cli import main
+from ctm_plugin.compose.compose import conf_dir
 from ctm_plugin.cpu import allocator
 from ctm_plugin.errors import CTMError
 from ctm_plugin.runs import train as training
 from ctm_plugin.runs.assemble import assemble
-from ctm_plugin.runs.compose import conf_dir
 from ctm_plugin.runs.rundir import CONFIG, METRICS, load_config, save_config
 
 

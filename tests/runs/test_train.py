@@ -19,13 +19,13 @@ from ctm_plugin.backbones.base import Backbone
 from ctm_plugin.backbones.dvgo import DVGO
 from ctm_plugin.backbones.voxels import VoxelField
 from ctm_plugin.color.light import Light
+from ctm_plugin.compose.compose import conf_dir
 from ctm_plugin.cpu import adam
 from ctm_plugin.data.blender import BlenderConfig
 from ctm_plugin.errors import CheckpointError, ConfigError
 from ctm_plugin.metrics.image import psnr
 from ctm_plugin.runs.assemble import assemble
 from ctm_plugin.runs.cameras import CAMERAS_FILE
-from ctm_plugin.runs.compose import conf_dir
 from ctm_plugin.runs.data import DATA_FILE
 from ctm_plugin.runs.evaluate import evaluate
 from ctm_plugin.runs.provenance import code_version, versions

@@ -10,10 +10,10 @@ from hydra.errors import HydraException
 
 from ctm_plugin import cli
 from ctm_plugin.errors import CTMError, Interrupted
-from ctm_plugin.runs import demo
 from ctm_plugin.settings import registry
 from ctm_plugin.settings.commands import TRAINING, VERBS, described, form
 from ctm_plugin.settings.registry import load
+from ctm_plugin.workflows import demo
 
 BESIDE = sorted(VERBS.keys() - {"train"})
 OF_RUNS = [name for name in BESIDE if VERBS[name].words.startswith("RUN")]

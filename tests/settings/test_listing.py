@@ -4,8 +4,8 @@ import re
 from importlib.metadata import EntryPoint
 
 from ctm_plugin.cli import main
-from ctm_plugin.runs.choices import GROUPS
-from ctm_plugin.runs.compose import conf_dir
+from ctm_plugin.compose.choices import GROUPS
+from ctm_plugin.compose.compose import conf_dir
 from ctm_plugin.settings import registry
 from ctm_plugin.settings.listing import choices, plain
 from ctm_plugin.settings.registry import REGISTRIES

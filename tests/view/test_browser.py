@@ -15,8 +15,8 @@ from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
 from ctm_plugin.data.readers.key_frames import read_key_frames
-from ctm_plugin.runs.settings import ViewConfig
 from ctm_plugin.view.server import Viewer
+from ctm_plugin.view.settings import ViewConfig
 from ctm_plugin.view.sources import Subject
 
 CANVAS = {"x": 0, "y": 0, "width": 300, "height": 400}

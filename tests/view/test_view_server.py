@@ -14,11 +14,11 @@ import torch
 import viser
 
 from ctm_plugin.color.light import Light
-from ctm_plugin.runs.settings import ViewConfig
 from ctm_plugin.view.command import view
 from ctm_plugin.view.page import NOTHING, PHOTOGRAPH, Page
 from ctm_plugin.view.painter import Look, Renderings, Viewpoint
 from ctm_plugin.view.server import Viewer, admitted, check_free, names
+from ctm_plugin.view.settings import ViewConfig
 from ctm_plugin.view.sources import Subject
 
 HERE = "127.0.0.1:8080"

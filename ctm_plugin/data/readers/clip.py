@@ -67,8 +67,10 @@ def read_clip(path: Path) -> ClipHeader:
     require_file(path, CLIP_EXPECTED)
     output = subprocess.run(_ffmpeg(path), capture_output=True, text=True, errors="replace").stderr
     if " Video: " not in output:
-        found = "no moving pictures" if "Input #0" in output else f"a clip that cannot be read ({_first(output)})"
-        raise DataError(path, found, CLIP_EXPECTED)
+        if "Input #0" in output:
+            raise DataError(path, "no moving pictures", CLIP_EXPECTED)
+        with told(path, "a clip that cannot be read", CLIP_EXPECTED):
+            raise OSError(_first(output))
     return header_of(output)
 
 

@@ -6,7 +6,7 @@ import os
 import shlex
 import unicodedata
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import lru_cache
 from pathlib import Path, PurePosixPath, PureWindowsPath
 
@@ -49,13 +49,16 @@ def reason(error: BaseException) -> str:
 def told(path: Path, found: str, expected: str) -> Iterator[None]:
     """Context that turns any error into a :class:`DataError` with the file, what was ``found`` and ``expected``.
 
-    Systems and decoders raise all that their parsers do on damaged files: OSError, SyntaxError, struct.error, ...
+    Systems and decoders raise all that their parsers do on damaged files: OSError, SyntaxError, struct.error, ... Where
+    the file is empty or was not fetched by Git LFS, the error says so.
     """
     try:
         yield
     except CTMError:
         raise
     except Exception as error:
+        with suppress(OSError), path.open("rb") as file:
+            check_head(path, file.read(len(LFS_POINTER)), expected)
         raise DataError(path, f"{found} ({reason(error)})", expected) from error
 
 
@@ -73,25 +76,37 @@ def require_folder(root: str | Path, expected: str) -> Path:
 
 
 def require_file(path: Path, expected: str) -> None:
-    """Refuse a path that is no regular file (a pipe would block, a device never end), or not fetched by Git LFS."""
+    """Refuse a path that is no regular file: a pipe would block, a device never end. The file is not opened."""
     with told(path, "a file that cannot be read", expected):
         if not path.exists():
             raise DataError(path, "no such file", expected)
         if not path.is_file():
             raise DataError(path, "something that is not a file", expected)
-        with path.open("rb") as file:
-            head = file.read(len(LFS_POINTER))
-        if not head:
-            raise DataError(path, "an empty file", expected)
-        if head == LFS_POINTER:
-            raise DataError(path, "a Git LFS pointer in place of the file", f"{expected}: git lfs pull fetches it")
+
+
+def check_head(path: Path, head: bytes, expected: str) -> None:
+    """Refuse a file by its first bytes: an empty one, or one not fetched by Git LFS."""
+    if not head:
+        raise DataError(path, "an empty file", expected)
+    if head.startswith(LFS_POINTER):
+        raise DataError(path, "a Git LFS pointer in place of the file", f"{expected}: git lfs pull fetches it")
+
+
+def state_of(path: Path) -> tuple[int, int] | None:
+    """Time of a file's last change, and its size: what was read of it is kept until they differ; ``None``: no file."""
+    with suppress(OSError, ValueError):
+        state = path.stat()
+        return state.st_mtime_ns, state.st_size
+    return None
 
 
 def read_bytes(path: Path, expected: str) -> bytes:
     """Read a file's content."""
     require_file(path, expected)
     with told(path, "a file that cannot be read", expected):
-        return path.read_bytes()
+        content = path.read_bytes()
+    check_head(path, content, expected)
+    return content
 
 
 def is_picture(path: Path) -> bool:

@@ -6,6 +6,7 @@ import warnings
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +17,15 @@ from torch import Tensor
 
 from ctm_plugin.color.srgb import linear_to_srgb
 from ctm_plugin.data.readers.deep import colored, numbers, open_deep, opened_file
-from ctm_plugin.data.readers.folders import PHONE_SUFFIXES, others_hint, require_file, told
+from ctm_plugin.data.readers.folders import (
+    LFS_POINTER,
+    PHONE_SUFFIXES,
+    check_head,
+    others_hint,
+    require_file,
+    state_of,
+    told,
+)
 from ctm_plugin.data.readers.picture import (
     MAX_PIXELS,
     UPRIGHT_ORIENTATION,
@@ -52,15 +61,17 @@ def opened(path: Path) -> Iterator[Image.Image]:
     """Context with Pillow's picture of a file, not yet decoded; DataError: it is no ``PILLOW_FORMATS`` or HEIC."""
     expected = f"a whole image ({', '.join(PILLOW_FORMATS)}, HEIC) of at most {MAX_PIXELS} pixels"
     require_file(path, expected)
-    with told(path, "an image that cannot be read", f"{expected}: copy it here again, or leave it out"):
-        with path.open("rb") as file:
-            head = file.read(12)
-        heif = head[4:8] == b"ftyp" and head[8:] not in AVIF_BRANDS
+    expected_whole = f"{expected}: copy it here again, or leave it out"
+    with told(path, "an image that cannot be read", expected_whole), path.open("rb") as file:
+        head = file.read(len(LFS_POINTER))
+        file.seek(0)
+        heif = head[4:8] == b"ftyp" and head[8:12] not in AVIF_BRANDS
         try:
-            image = Image.open(path, formats=(*PILLOW_FORMATS, *heif_formats()) if heif else PILLOW_FORMATS)
+            image = Image.open(file, formats=(*PILLOW_FORMATS, *heif_formats()) if heif else PILLOW_FORMATS)
         except Image.UnidentifiedImageError as error:
             if head[4:8] == b"ftyp":
                 raise OSError("damaged, or of no kind that is known") from error
+            check_head(path, head, expected)
             kind = next((kind for start, kind in FOREIGN_SIGNATURES.items() if head.startswith(start)), None)
             found = f"a picture of {kind}'s kind" if kind else "something that is not an image"
             raise DataError(path, found, f"{expected}; {others_hint([path])}") from error
@@ -172,19 +183,29 @@ class PictureFile:
         In [0, 1], but for float TIFF and EXR, whose linear light may be more.
         """
         with self.decode(self.path) as (_, pixels):
-            turned = turn(pixels().numpy(), self.header.orientation)
-        return torch.from_numpy(np.ascontiguousarray(turned))
+            return upright(pixels(), self.header)
 
 
 def read_picture(path: Path, decode: Decoder = open_picture) -> PictureFile:
-    """Read a picture's header, without decoding it."""
+    """Read a picture's header, without decoding it; cached until the file changes."""
+    return _read(path, decode, state_of(path))
+
+
+@lru_cache(maxsize=4096)
+def _read(path: Path, decode: Decoder, _state: tuple[int, int] | None) -> PictureFile:
     with decode(path) as (header, _):
         return PictureFile(path, header, decode)
 
 
-def read_image(path: Path) -> Float32[Tensor, "h w c"]:
+def read_image(path: Path, decode: Decoder = open_picture) -> Float32[Tensor, "h w c"]:
     """Read a picture's pixels, see :meth:`PictureFile.image`."""
-    return read_picture(path).image()
+    with decode(path) as (header, pixels):
+        return upright(pixels(), header)
+
+
+def upright(pixels: Float32[Tensor, "h w c"], header: Header) -> Float32[Tensor, "h w c"]:
+    """Turn stored pixels as their header says."""
+    return torch.from_numpy(np.ascontiguousarray(turn(pixels.numpy(), header.orientation)))
 
 
 def read_depth(path: Path, scale: float) -> Float32[Tensor, "h w"]:

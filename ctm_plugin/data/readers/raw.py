@@ -17,7 +17,7 @@ from PIL.ExifTags import IFD
 from torch import Tensor
 
 from ctm_plugin.color.srgb import linear_to_srgb
-from ctm_plugin.data.readers.folders import read_bytes, require_file, told
+from ctm_plugin.data.readers.folders import require_file, told
 from ctm_plugin.data.readers.hot_pixels import repair
 from ctm_plugin.data.readers.picture import MAX_PIXELS, Header, Lens, Opened, check_size, exposure_of, lens_of
 from ctm_plugin.errors import CTMError
@@ -121,8 +121,10 @@ def raw_exif(path: Path) -> dict[int, Any]:
     Empty: the file is not based on TIFF, as most raw formats are.
     """
     exif = Image.Exif()
+    require_file(path, "a raw picture")
     try:
-        exif.load(read_bytes(path, "a raw picture"))
-        return {**exif, **exif.get_ifd(IFD.Exif)}
+        with path.open("rb") as file:
+            exif.load_from_fp(file)
+            return {**exif, **exif.get_ifd(IFD.Exif)}
     except (SyntaxError, struct.error, ValueError, KeyError, TypeError):  # what Pillow raises on other files
         return {}

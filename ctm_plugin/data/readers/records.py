@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
-from ctm_plugin.data.readers.folders import inside, read_bytes, require_file, told
+from ctm_plugin.data.readers.folders import inside, read_bytes, state_of, told
 from ctm_plugin.errors import DataError
 from ctm_plugin.scene.poses import MAX_COORDINATE
 from ctm_plugin.settings.setting import Number, is_number
@@ -100,13 +100,11 @@ def parse_record(content: bytes, source: Path) -> Record:
 
 def read_record(path: Path) -> Record:
     """Read the JSON object in a file, cached until the file changes: callers must not change it."""
-    require_file(path, "a JSON file")
-    state = path.stat()
-    return _parsed(path, state.st_mtime_ns, state.st_size)
+    return _parsed(path, state_of(path))
 
 
 @lru_cache(maxsize=4)
-def _parsed(path: Path, _changed: int, _size: int) -> Record:
+def _parsed(path: Path, _state: tuple[int, int] | None) -> Record:
     return parse_record(read_bytes(path, "a JSON file"), path)
 
 

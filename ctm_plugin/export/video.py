@@ -18,9 +18,9 @@ from ctm_plugin.cpu.products import fast_products
 from ctm_plugin.data.readers.key_frames import read_key_frames
 from ctm_plugin.data.rig import SURROUND_DEGREES, turn
 from ctm_plugin.errors import ConfigError
+from ctm_plugin.export.settings import VideoConfig, can_mp4
 from ctm_plugin.files import replacing
 from ctm_plugin.runs.load import LoadedRun, load_posed
-from ctm_plugin.runs.settings import VideoConfig, can_mp4
 from ctm_plugin.scene.camera_paths import KeyFrames, capture, orbit, spiral
 from ctm_plugin.scene.views import Scene, Views
 from ctm_plugin.settings.setting import Number

@@ -14,15 +14,15 @@ from ctm_plugin.color.light import Light, chosen_light
 from ctm_plugin.cpu.products import fast_products
 from ctm_plugin.data.readers.images import to_8_bits
 from ctm_plugin.errors import ConfigError
+from ctm_plugin.export.captures import Dots, write_capture
+from ctm_plugin.export.page import write_page
+from ctm_plugin.export.settings import ExportConfig
+from ctm_plugin.export.splats import TRAIN_STEPS, likeness, lit_view, plain, read_splats, write_splats
+from ctm_plugin.export.surface import Surface, cloud, mesh
+from ctm_plugin.export.video import check_new
 from ctm_plugin.files import replacing_folder
-from ctm_plugin.runs.captures import Dots, write_capture
 from ctm_plugin.runs.load import LoadedRun, load_posed
-from ctm_plugin.runs.page import write_page
 from ctm_plugin.runs.rundir import ALL, PAGE
-from ctm_plugin.runs.settings import ExportConfig
-from ctm_plugin.runs.splats import TRAIN_STEPS, likeness, lit_view, plain, read_splats, write_splats
-from ctm_plugin.runs.surface import Surface, cloud, mesh
-from ctm_plugin.runs.video import check_new
 from ctm_plugin.scene.poses import IDENTITY
 from ctm_plugin.scene.views import Scene, Views, composite
 from ctm_plugin.show.bars import tracked

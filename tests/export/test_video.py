@@ -11,9 +11,9 @@ import pytest
 import torch
 
 from ctm_plugin.cli import main
-from ctm_plugin.runs import video as module
+from ctm_plugin.export import video as module
+from ctm_plugin.export.video import film_cameras, rendered, write_video
 from ctm_plugin.runs.load import load_posed
-from ctm_plugin.runs.video import film_cameras, rendered, write_video
 from ctm_plugin.scene.camera_paths import KeyFrames
 
 SIZES = ("trainer=smoke", "backbone.steps_alone=60", "backbone.coarse=false", "backbone.grow=[]", "ctm=off")
@@ -119,7 +119,7 @@ def test_mp4_where_the_extra_is_installed(run, monkeypatch, refused):
     monkeypatch.setattr(module, "can_mp4", lambda: False)
     assert main(["render", str(run), "frames=2", "overwrite=true"]) == 0
     assert len(frames(run / "video/orbit.gif")) == 2
-    monkeypatch.setattr("ctm_plugin.runs.settings.can_mp4", lambda: False)
+    monkeypatch.setattr("ctm_plugin.export.settings.can_mp4", lambda: False)
     assert "pip install -e '.[video]'" in refused("render", run, "out=x.mp4")
 
 

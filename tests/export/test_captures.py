@@ -13,8 +13,8 @@ from ctm_plugin.data.colmap import ColmapConfig
 from ctm_plugin.data.llff import LLFFConfig
 from ctm_plugin.data.readers.colmap_model import read_points
 from ctm_plugin.data.readers.ply import read_ply
+from ctm_plugin.export.captures import seen, write_capture
 from ctm_plugin.rays.cameras import camera_rays
-from ctm_plugin.runs.captures import seen, write_capture
 from ctm_plugin.scene.views import Points, Scene, Views
 
 LENS = (-0.05, 0.01, 0.001, -0.002, 0.003)

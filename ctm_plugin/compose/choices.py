@@ -10,8 +10,8 @@ from typing import Any
 from hydra.core.config_store import ConfigStore
 from omegaconf.errors import OmegaConfBaseException
 
+from ctm_plugin.compose.checks import kind_of
 from ctm_plugin.errors import ConfigError, CTMError, DataError
-from ctm_plugin.runs.checks import kind_of
 from ctm_plugin.settings.as_typed import as_typed, bare, is_sweep, values_of
 from ctm_plugin.settings.build import SECTIONS
 from ctm_plugin.settings.registry import CALLBACKS, CTM_SETTINGS, DATASETS, PRESET_SETTINGS, REGISTRIES, conf_dir, load

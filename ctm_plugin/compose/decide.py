@@ -9,12 +9,12 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
+from ctm_plugin.compose.checks import own
 from ctm_plugin.data.capture import Capture
 from ctm_plugin.data.load import Layout
 from ctm_plugin.data.rig import Rig
 from ctm_plugin.errors import CTMError
-from ctm_plugin.runs.checks import own
-from ctm_plugin.runs.processes import is_main_process
+from ctm_plugin.files import is_main_process
 from ctm_plugin.scene.kinds import AUTO, GEOMETRIES
 from ctm_plugin.settings.build import build
 from ctm_plugin.settings.registry import BACKBONES, DATASETS

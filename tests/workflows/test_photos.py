@@ -1,5 +1,6 @@
 """One command from photographs to lit views, on a hall that is dark."""
 
+import os
 import shlex
 import shutil
 import sys
@@ -11,7 +12,7 @@ from PIL import Image
 
 from ctm_plugin.cli import main
 from ctm_plugin.errors import DataError
-from ctm_plugin.runs.photos import choices
+from ctm_plugin.workflows.photos import choices
 
 SMALL = ("trainer=smoke", "backbone=dvgo", "backbone.steps_alone=3", "backbone.grow=[]", "dataset.exposure=0.05")
 
@@ -68,7 +69,7 @@ def test_stopped_before_the_film_the_same_command_makes_it(capture, capsys, monk
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr("ctm_plugin.runs.video.film", stopped)
+        patch.setattr("ctm_plugin.export.video.film", stopped)
         assert main(["photos", str(capture), "again=true", *SMALL]) == 130
     assert f"stopped; go on with: ctm photos '{capture}' again=true " in capsys.readouterr().err
     assert main(["photos", str(capture), "again=true", *SMALL]) == 0
@@ -101,7 +102,10 @@ def test_a_dry_run_without_cameras(tmp_path, monkeypatch, capsys):
     assert "capture: found no photographs and no clips" in capsys.readouterr().err
     for name in ("a.jpg", "b.HEIC", "c.mov"):
         (tmp_path / "capture" / name).write_bytes(b"x")
+    walked, walk = [], os.walk
+    monkeypatch.setattr(os, "walk", lambda folder, **more: walked.append(folder) or walk(folder, **more))
     assert main(["photos", "capture", "-c", "job", "minutes=3"]) == 0
+    assert walked == [Path("capture")]  # once
     assert capsys.readouterr().out.splitlines() == [
         "cameras: none found; COLMAP would search for them in 2 photographs and 1 clips",
         "then width and budget would be chosen for minutes=3",
@@ -133,7 +137,7 @@ def test_photographs_that_were_added_are_searched_anew(capture, monkeypatch, cap
         raise DataError(root, "no place", "some")
 
     monkeypatch.setattr("ctm_plugin.cameras.command.place", place)
-    monkeypatch.setattr("ctm_plugin.runs.photos.added", lambda root, name: ["new.png"])
+    monkeypatch.setattr("ctm_plugin.workflows.photos.added", lambda root, name: ["new.png"])
     assert main(["photos", str(capture), *SMALL]) == 1
     assert asked == [True]
     assert "cameras: 1 photographs were added since the search; COLMAP searches" in capsys.readouterr().out

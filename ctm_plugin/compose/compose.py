@@ -15,9 +15,9 @@ from hydra.errors import HydraException, MissingConfigException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
 
+from ctm_plugin.compose.checks import checked
+from ctm_plugin.compose.choices import GROUPS, normalise, register, with_fitting_dataset, with_usual_backbone
 from ctm_plugin.errors import ConfigError, DataError, printable
-from ctm_plugin.runs.checks import checked
-from ctm_plugin.runs.choices import GROUPS, normalise, register, with_fitting_dataset, with_usual_backbone
 from ctm_plugin.scene.kinds import AUTO
 from ctm_plugin.settings.as_typed import grammar, is_sweep
 from ctm_plugin.settings.build import SECTIONS, unknown_choice, unknown_key
@@ -47,7 +47,7 @@ def compose(*arguments: str) -> dict[str, Any]:
     """
     given = prepared(arguments)
     refuse_several(given)
-    from ctm_plugin.runs.decide import decide
+    from ctm_plugin.compose.decide import decide
 
     with at_work():
         config = hydra.compose("config", given)

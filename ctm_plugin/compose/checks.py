@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import fields
-from types import SimpleNamespace
 from typing import Any, TypeVar
 
 from ctm_plugin.errors import ConfigError
@@ -15,8 +14,8 @@ from ctm_plugin.settings.setting import MAX_INT, Nothing
 T = TypeVar("T")
 
 
-def checked(config: Config, watched: bool = True) -> SimpleNamespace:
-    """Build the settings of all sections: checked dataclasses by the sections' names.
+def checked(config: Config, watched: bool = True) -> dict[str, Any]:
+    """Build the settings of all sections but ``ctm``: a checked dataclass each, of ``callbacks`` one by each name.
 
     Args:
         config: the resolved configuration.
@@ -48,7 +47,7 @@ def checked(config: Config, watched: bool = True) -> SimpleNamespace:
     callbacks = {
         name: build(CALLBACKS.settings(name), node, f"callbacks.{name}") for name, node in named.items() if watched
     }
-    return SimpleNamespace(**parts, callbacks=callbacks)
+    return {**parts, "callbacks": callbacks}
 
 
 def section_of(config: Config, section: str) -> Any:

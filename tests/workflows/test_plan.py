@@ -5,9 +5,9 @@ import time
 import pytest
 import torch
 
-from ctm_plugin.runs import plan as module
 from ctm_plugin.runs.assemble import assemble
-from ctm_plugin.runs.plan import BUDGET_STEPS, COLUMNS, MAX_COLUMNS, REFERENCE, Plan, Timed, plan, timed_steps
+from ctm_plugin.workflows import plan as module
+from ctm_plugin.workflows.plan import BUDGET_STEPS, COLUMNS, MAX_COLUMNS, REFERENCE, Plan, Timed, plan, timed_steps
 
 PHOTOS = (3000, 4000)
 

@@ -15,11 +15,11 @@ from browser import opened, seen, until
 from PIL import Image
 
 from ctm_plugin.cli import main
+from ctm_plugin.export import page as pages
+from ctm_plugin.export.page import write_page
+from ctm_plugin.export.video import write_video
 from ctm_plugin.metrics.evaluate import Scoring
-from ctm_plugin.runs import page as pages
 from ctm_plugin.runs.load import load_posed
-from ctm_plugin.runs.page import write_page
-from ctm_plugin.runs.video import write_video
 
 
 @pytest.fixture(scope="module")

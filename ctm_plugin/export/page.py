@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import imageio.v3 as iio
 import numpy as np
 import torch
-from jinja2 import Environment, PackageLoader
+from jinja2 import Environment, FileSystemLoader
 from PIL import Image
 
 from ctm_plugin import __version__
@@ -24,12 +24,12 @@ from ctm_plugin.backbones.splat import Splat
 from ctm_plugin.color.light import AS_IS, Light
 from ctm_plugin.cpu.products import fast_products
 from ctm_plugin.data.readers.images import to_8_bits
+from ctm_plugin.export.splats import MAX_CAMERAS, cameras_in_files, lit_view, plain
+from ctm_plugin.export.video import encoded
 from ctm_plugin.files import write_text
 from ctm_plugin.runs.evaluate import LITTLE_DETAIL
 from ctm_plugin.runs.load import LoadedRun
 from ctm_plugin.runs.rundir import METRICS, film_of, read_json
-from ctm_plugin.runs.splats import MAX_CAMERAS, cameras_in_files, lit_view, plain
-from ctm_plugin.runs.video import encoded
 from ctm_plugin.scene.poses import IDENTITY
 from ctm_plugin.show.bars import tracked
 from ctm_plugin.show.walk import Spots, Start, walk
@@ -95,7 +95,7 @@ def write_page(path: Path, run: Path, posed: LoadedRun, light: Light) -> None:
 def page(run: Path, posed: LoadedRun, light: Light, scores: Mapping[str, Any], parts: Mapping[str, Any]) -> str:
     """A run's page as HTML that needs no other file."""
     return html(
-        "page",
+        Path(__file__).with_name("page.html.jinja"),
         name=posed.module.scene.name,
         dark=light != AS_IS,
         facts=facts(posed, light, scores),
@@ -104,11 +104,11 @@ def page(run: Path, posed: LoadedRun, light: Light, scores: Mapping[str, Any], p
     )
 
 
-def html(kind: str, **values: Any) -> str:
-    """Fill a template of a page with values, text escaped."""
-    environment = Environment(loader=PackageLoader("ctm_plugin.runs", "."), autoescape=True)
+def html(template: Path, **values: Any) -> str:
+    """Fill a template, which may extend ``base.html.jinja``, with values, text escaped."""
+    environment = Environment(loader=FileSystemLoader([template.parent, Path(__file__).parent]), autoescape=True)
     environment.policies["json.dumps_kwargs"] = {"ensure_ascii": False}
-    return environment.get_template(f"{kind}.html.jinja").render(version=__version__, **values)
+    return environment.get_template(template.name).render(version=__version__, **values)
 
 
 def facts(posed: LoadedRun, light: Light, scores: Mapping[str, Any]) -> list[str]:

@@ -9,12 +9,12 @@ import torch
 from PIL import Image
 
 from ctm_plugin.cli import main
+from ctm_plugin.compose import decide
+from ctm_plugin.compose.compose import compose
 from ctm_plugin.data.blender import BlenderConfig
 from ctm_plugin.data.llff import LLFFConfig
 from ctm_plugin.data.readers import records as reading
 from ctm_plugin.data.rig import Rig
-from ctm_plugin.runs import decide
-from ctm_plugin.runs.compose import compose
 
 
 @pytest.mark.parametrize(

@@ -2,7 +2,7 @@
 
 import pytest
 
-from ctm_plugin.runs.demo import advice
+from ctm_plugin.workflows.demo import advice
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ctm_plugin.cli import main
-from ctm_plugin.runs.choices import GROUPS, normalise
+from ctm_plugin.compose.choices import GROUPS, normalise
 
 WORDS = st.sampled_from([*GROUPS, "seed", "hydra", "x"])
 ARGUMENTS = st.one_of(

@@ -8,21 +8,22 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from ctm_plugin.cameras.clips import root_of, take_frames
-from ctm_plugin.cameras.photographs import PICTURE_SUFFIXES, added, below, home_of, list_photographs
+from ctm_plugin.cameras.photographs import PICTURE_SUFFIXES, added, home_and_files, list_photographs
 from ctm_plugin.cameras.raws import develop_raws
 from ctm_plugin.cameras.settings import DEFAULT_FOLDER, CamerasConfig
+from ctm_plugin.compose.compose import compose
+from ctm_plugin.compose.decide import composites_there, has_gpu
 from ctm_plugin.data.readers.clip import CLIP_SUFFIXES
 from ctm_plugin.data.readers.folders import is_picture, require_folder
 from ctm_plugin.data.readers.images import read_picture
 from ctm_plugin.data.readers.layouts import layouts
 from ctm_plugin.errors import CheckpointError, ConfigError, DataError
-from ctm_plugin.runs.compose import compose
-from ctm_plugin.runs.decide import composites_there, has_gpu
+from ctm_plugin.export.settings import VideoConfig
 from ctm_plugin.runs.rundir import ALL, CONFIG, METRICS, PAGE, film_of, load_config
-from ctm_plugin.runs.settings import PhotosConfig, VideoConfig
 from ctm_plugin.settings.build import build
 from ctm_plugin.settings.registry import DATASETS
 from ctm_plugin.show.bars import whole
+from ctm_plugin.workflows.settings import PhotosConfig
 
 RUNS = Path("runs")
 """Folder of the runs."""
@@ -59,11 +60,11 @@ def photos(folder: Path, settings: PhotosConfig, others: Sequence[str] = ()) -> 
             read_picture(path)
     # These take seconds to import: what lies in the folder is refused before.
     from ctm_plugin.cameras.command import place, tell
-    from ctm_plugin.runs.export import write_views
+    from ctm_plugin.export.export import write_views
+    from ctm_plugin.export.page import write_page
+    from ctm_plugin.export.video import film
     from ctm_plugin.runs.load import load_posed
-    from ctm_plugin.runs.page import write_page
     from ctm_plugin.runs.train import resume, train
-    from ctm_plugin.runs.video import film
     from ctm_plugin.show.console import output_console, print_file, print_next
 
     console = output_console()
@@ -107,7 +108,7 @@ def dry_run(folder: Path, settings: PhotosConfig, others: Sequence[str] = ()) ->
     """
     root, run, why = begun(folder, settings, others)
     if why:
-        files = [folder] if root != folder else below(home_of(root, DEFAULT_FOLDER))
+        files = [folder] if root != folder else home_and_files(root, DEFAULT_FOLDER)[1]
         kinds = {"photographs": PICTURE_SUFFIXES, "clips": CLIP_SUFFIXES}
         counts = {kind: sum(path.suffix.lower() in suffixes for path in files) for kind, suffixes in kinds.items()}
         if not any(counts.values()):
@@ -160,7 +161,7 @@ def check_writable(run: Path) -> None:
 
 def parts(root: Path, seconds: float) -> dict[str, float]:
     """Guess the seconds of each part of the command, for the progress bar over all of them."""
-    count = sum(map(is_picture, below(home_of(root, DEFAULT_FOLDER))))
+    count = sum(map(is_picture, home_and_files(root, DEFAULT_FOLDER)[1]))
     finding = {} if layouts(root) else {"brightness": 0.1, "details": 0.5, "pairs": 0.5, "placed": 0.4, "refined": 0.4}
     times = {what: count * each for what, each in finding.items()}
     return {
@@ -194,7 +195,7 @@ def choices(root: Path, minutes: float, others: Sequence[str], say: Callable[[st
 
     from ctm_plugin.cameras.exposures import UNEVEN, spread_of_gains
     from ctm_plugin.runs.assemble import assemble
-    from ctm_plugin.runs.plan import REFERENCE, TIMED_COLUMNS, plan, timed_steps
+    from ctm_plugin.workflows.plan import REFERENCE, TIMED_COLUMNS, plan, timed_steps
 
     layout = layouts(root)[0]
     chosen = {"dataset": layout, "dataset.root": root.resolve(), "ctm": "auto"}

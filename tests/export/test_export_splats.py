@@ -13,9 +13,9 @@ from ctm_plugin.backbones.splat import NEAR_FRACTION, Splat
 from ctm_plugin.cli import main
 from ctm_plugin.color.light import Light
 from ctm_plugin.data.llff import LLFFConfig
+from ctm_plugin.export.splats import cameras_in_files, in_files, likeness, read_splats, render_splats, write_splats
+from ctm_plugin.export.surface import spanned
 from ctm_plugin.runs.load import load_posed
-from ctm_plugin.runs.splats import cameras_in_files, in_files, likeness, read_splats, render_splats, write_splats
-from ctm_plugin.runs.surface import spanned
 from ctm_plugin.splats.gaussians import Gaussians, camera_of, colors_seen
 
 
@@ -121,7 +121,7 @@ def run(tmp_path_factory) -> Path:
 
 @pytest.mark.slow
 def test_lit_splats_from_the_command_line(run, capsys, refused, tmp_path, monkeypatch):
-    monkeypatch.setattr("ctm_plugin.runs.export.TRAIN_STEPS", 100)
+    monkeypatch.setattr("ctm_plugin.export.export.TRAIN_STEPS", 100)
     assert main(["export", str(run)]) == 0
     file, told = run / "export/splats.ply", capsys.readouterr().out
     assert f"written to {file}" in told

@@ -14,12 +14,12 @@ from PIL import Image
 from rich.console import Console
 from rich.table import Table
 
+from ctm_plugin.compose.compose import compose
 from ctm_plugin.data.readers.images import to_8_bits
+from ctm_plugin.export.page import html, picture_url
 from ctm_plugin.files import write_text
 from ctm_plugin.metrics.table import Metric, told_at
-from ctm_plugin.runs.compose import compose
 from ctm_plugin.runs.load import load_run
-from ctm_plugin.runs.page import html, picture_url
 from ctm_plugin.runs.rundir import PAGE
 from ctm_plugin.runs.train import train
 from ctm_plugin.scene.views import composite
@@ -86,7 +86,8 @@ def write_demo(runs: Mapping[str, Path], results: Mapping[str, Mapping[str, Any]
         urls = {kind: picture_url(Image.fromarray(to_8_bits(each).numpy())) for kind, each in pictures.items()}
         shots.append({"name": DEMO_LABELS[ctm], "score": f"brightened PSNR {score:.2f} dB", **urls})
     size = (scene.test.width, scene.test.height)
-    write_text(path, html("demo", name="In the dark, three times", size=size, told=advice(results), shots=shots))
+    template = Path(__file__).with_name("demo.html.jinja")
+    write_text(path, html(template, name="In the dark, three times", size=size, told=advice(results), shots=shots))
 
 
 def advice(results: Mapping[str, Mapping[str, Any]]) -> str:

@@ -1,0 +1,1 @@
+"""What a run gives to others: films, a page, and files for other programs."""

@@ -1,0 +1,1 @@
+"""Verbs that do several others in a row: photographs to a page, and the demo."""
