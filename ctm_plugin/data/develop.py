@@ -44,7 +44,7 @@ def means_matter(pictures: Sequence[PictureFile | None], config: PhotoConfig) ->
     if all(config.shrunk(*picture.header[:2]) == picture.header[:2] for picture in there):
         return False
     few = there[:: -(-len(there) // SAMPLE_PICTURES)]
-    colours = [shrink(each.image()[..., :3].clamp(0, 1), *config.shrunk(*each.header[:2])).flatten() for each in few]
+    colours = [shrink(each.pixels()[..., :3], *config.shrunk(*each.header[:2])).clamp(0, 1).flatten() for each in few]
     return float(np.quantile(torch.cat(colours).numpy(), 0.99)) < DARK_LEVEL
 
 
@@ -80,10 +80,12 @@ def develop(
     clipped = []
 
     def fill(index: int) -> None:
-        image = pictures[index].image()
-        if image.amin() < 0 or image.amax() > 1:
-            clipped.append(pictures[index].path.name)
-        image = shrink(image.clamp_(0.0, 1.0), *config.shrunk(*image.shape[:2]))
+        image = pictures[index].pixels()
+        if image.dtype != torch.uint8:
+            if image.amin() < 0 or image.amax() > 1:
+                clipped.append(pictures[index].path.name)
+            image = image.clamp_(0.0, 1.0)
+        image = shrink(image, *config.shrunk(*image.shape[:2]))
         colour, alpha = image[..., :3], image[..., 3:]
         if config.exposure != 1:
             colour = brighten(colour, config.exposure, "hard")

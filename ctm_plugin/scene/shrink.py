@@ -9,19 +9,24 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float, Float32
 from torch import Tensor
 
+from ctm_plugin.scene.views import Pixels, unit
+
 FULL_COVERAGE = 1 - 1e-5
 """Share of a pixel's area that counts as all, but for rounding."""
+STRIP = 16
+"""Rows of a downscaled picture that are computed at once: all in float32 would fill the memory."""
 
 
-def shrink(image: Float32[Tensor, "h w c"], height: int, width: int) -> Float32[Tensor, "h2 w2 c"]:
+def shrink(image: Pixels, height: int, width: int) -> Float32[Tensor, "h2 w2 c"]:
     """Downscale a picture by means over each larger pixel's area; with alpha, of premultiplied colour.
 
     Colour is ``mean(a c) / mean(a)``: ``[H, W, C]`` with straight alpha in and out; 0 where alpha is 0.
     """
     if image.shape[:2] == (height, width):
-        return image
+        return unit(image)
     if image.shape[-1] == 3:
         return area(image, height, width)
+    image = unit(image)
     alpha = image[..., 3:]
     small = area(torch.cat([image[..., :3] * alpha, alpha], dim=-1), height, width)
     colour, alpha = small[..., :3], small[..., 3:]
@@ -29,18 +34,19 @@ def shrink(image: Float32[Tensor, "h w c"], height: int, width: int) -> Float32[
     return torch.cat([colour, alpha], dim=-1)
 
 
-def area(image: Float32[Tensor, "h w c"], height: int, width: int) -> Float32[Tensor, "h2 w2 c"]:
+def area(image: Pixels, height: int, width: int) -> Float32[Tensor, "h2 w2 c"]:
     """Means over the areas that ``height`` x ``width`` equal pixels cover, parts of pixels counted as parts.
 
     Pillow's box filter takes a pixel whole or not at all, which moves edges by up to half a pixel.
     """
     down, across = image.shape[0] / height, image.shape[1] / width
     if down == across and down.is_integer():
-        return F.avg_pool2d(image.permute(2, 0, 1), int(down)).permute(1, 2, 0)
+        strips = image.split(STRIP * int(down))
+        return torch.cat([F.avg_pool2d(unit(each).permute(2, 0, 1), int(down)).permute(1, 2, 0) for each in strips])
     return area_of_rows(area_of_rows(image, height).transpose(0, 1), width).transpose(0, 1).clamp(max=1.0)
 
 
-def area_of_rows(image: Float32[Tensor, "h w c"], height: int) -> Float32[Tensor, "h2 w c"]:
+def area_of_rows(image: Pixels, height: int) -> Float32[Tensor, "h2 w c"]:
     """Means over ``height`` equal parts of a picture's rows."""
     count = len(image)
     edges = torch.arange(height + 1, dtype=torch.float64) * count / height
@@ -49,7 +55,7 @@ def area_of_rows(image: Float32[Tensor, "h w c"], height: int) -> Float32[Tensor
     for step in range(math.ceil(count / height) + 1):
         row = first + step
         part = (torch.minimum(high, row + 1) - torch.maximum(low, row)).clamp(min=0) * height / count
-        total += part.float()[:, None, None] * image[row.clamp(max=count - 1)]
+        total += part.float()[:, None, None] * unit(image[row.clamp(max=count - 1)])
     return total
 
 

@@ -71,6 +71,8 @@ def test_what_is_written_is_read(tmp_path, suffix, dtype, channels):
     if kind == "f":
         expected = torch.cat([linear_to_srgb(expected[..., :3]), expected[..., 3:]], -1)
     torch.testing.assert_close(read_image(path), expected, atol=1e-7, rtol=1e-6)
+    if suffix in ("png", "webp"):
+        assert read_picture(path).pixels().dtype == (torch.uint8 if dtype == "u1" else torch.float32)
 
 
 @pytest.mark.parametrize("suffix", ["tif", "exr"])

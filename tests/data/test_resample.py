@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 
 from ctm_plugin.data.readers.images import to_8_bits
-from ctm_plugin.scene.shrink import area, shrink, shrink_depth, shrink_mask
+from ctm_plugin.scene.shrink import STRIP, area, shrink, shrink_depth, shrink_mask
 
 SIDES = st.integers(1, 17).flatmap(lambda large: st.tuples(st.just(large), st.integers(1, large)))
 
@@ -45,6 +45,15 @@ def test_means_over_areas(rows, columns, seed):
     expected = np.einsum("ih,jw,hwc->ijc", overlaps(*rows), overlaps(*columns), image)
     found = area(torch.from_numpy(image).float(), rows[1], columns[1])
     np.testing.assert_allclose(found, expected, atol=1e-6)
+
+
+@pytest.mark.parametrize(("height", "channels"), [(STRIP + 3, 3), (2 * STRIP, 3), (9, 4)])
+def test_8_bits_shrink_as_their_floats_do(height, channels):
+    """By 2, of more rows than a strip has, and by no whole number."""
+    levels = torch.from_numpy(np.random.default_rng(0).integers(0, 256, (2 * height, 8, channels), dtype=np.uint8))
+    for size in ((2 * height, 8), (height, 4), (height, 3)):
+        assert torch.equal(shrink(levels, *size), shrink(levels.float() / 255.0, *size))
+        assert shrink(levels, *size).shape == (*size, channels)
 
 
 @given(SIDES, SIDES, st.integers(0, 2**32 - 1))

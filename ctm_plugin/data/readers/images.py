@@ -40,6 +40,7 @@ from ctm_plugin.data.readers.picture import (
 )
 from ctm_plugin.data.readers.profiles import as_srgb, foreign, heif_colours, png_colours, png_gamma
 from ctm_plugin.errors import CTMError, DataError
+from ctm_plugin.scene.views import Pixels, unit
 
 PILLOW_FORMATS = ("PNG", "JPEG", "WEBP", "AVIF")
 """Formats that Pillow decodes here."""
@@ -138,6 +139,8 @@ def open_usual(path: Path) -> Iterator[Opened]:
                     stored = colored(numbers(file))
             else:
                 stored = as_srgb(np.array(image.convert("RGBA" if header.alpha else "RGB")), profile, grey)
+            if stored.dtype == np.uint8 and gamma is None:
+                return torch.from_numpy(stored)
             levels = float(np.iinfo(stored.dtype).max)
             picture = torch.from_numpy(stored.astype(np.float32)).div_(levels)
             if gamma is not None:
@@ -182,6 +185,10 @@ class PictureFile:
 
         In [0, 1], but for float TIFF and EXR, whose linear light may be more.
         """
+        return unit(self.pixels())
+
+    def pixels(self) -> Pixels:
+        """Decode the pixels as :meth:`image` does, but leave 8 bits, a quarter of the memory, as they are."""
         with self.decode(self.path) as (_, pixels):
             return upright(pixels(), self.header)
 

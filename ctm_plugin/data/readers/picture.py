@@ -16,6 +16,7 @@ from torch import Tensor
 
 from ctm_plugin.color.srgb import linear_to_srgb
 from ctm_plugin.errors import DataError
+from ctm_plugin.scene.views import Pixels
 
 MAX_PIXELS = 64_000_000
 """Largest number of pixels of a picture to decode, at 15 bytes each: a small file can claim more than memory holds."""
@@ -73,12 +74,12 @@ class Opened(NamedTuple):
 
     Attributes:
         header: see :class:`Header`.
-        pixels: ``[H, W, 3]``, or ``[H, W, 4]`` with straight alpha, float32 sRGB as the file stores them, not turned;
-            in [0, 1] unless it holds linear light.
+        pixels: ``[H, W, 3]``, or ``[H, W, 4]`` with straight alpha, sRGB as the file stores them, not turned: 8 bits,
+            or float32, in [0, 1] unless it holds linear light.
     """
 
     header: Header
-    pixels: Callable[[], Float32[Tensor, "h w c"]]
+    pixels: Callable[[], Pixels]
 
 
 Decoder = Callable[[Path], AbstractContextManager[Opened]]
