@@ -23,7 +23,7 @@ from ctm_plugin.optim.pace import Pace
 from ctm_plugin.optim.schedules import exponential
 from ctm_plugin.scene.views import Scene, Views
 from ctm_plugin.splats.gaussians import Camera, Gaussians, camera_of
-from ctm_plugin.splats.growth import Change, densify
+from ctm_plugin.splats.growth import Change, along_curve, densify
 from ctm_plugin.splats.render import INVERSE_CHANNELS, PLANE_CHANNELS, bends, expected_depth, picture
 from ctm_plugin.splats.scales import Stage, averaged, stages
 from ctm_plugin.splats.seen import as_wide_as_pixels
@@ -282,17 +282,18 @@ class Splat(PictureBackbone):
         rewrap(self.trainer)
 
     def _replace(self, change: Change) -> None:
-        """Replace rows of the Gaussians' parameters and of Adam's moments.
+        """Replace rows of the Gaussians' parameters and of Adam's moments, and order them :func:`along_curve`.
 
         Each table is a new parameter: the graph of an earlier step, if it still lives, knows the old one's size.
         """
+        order = along_curve(torch.cat([self.tables["means"][change.kept], change.added.means]))
         for name, added in change.added._asdict().items():
             old = self.tables[name]
-            self.tables[name] = table = nn.Parameter(torch.cat([old[change.kept], added]))
+            self.tables[name] = table = nn.Parameter(torch.cat([old[change.kept], added])[order])
             state = self.named_optimizers.exchange(old, table)
             for moment in ("exp_avg", "exp_avg_sq"):
                 if moment in state:
-                    state[moment] = torch.cat([state[moment][change.kept], torch.zeros_like(added)])
+                    state[moment] = torch.cat([state[moment][change.kept], torch.zeros_like(added)])[order]
         self.grad2d = torch.zeros(len(self.tables["means"]), device=self.device)
         self.grad2d_count = torch.zeros_like(self.grad2d)
 

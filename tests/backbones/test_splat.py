@@ -28,7 +28,7 @@ from ctm_plugin.runs.train import resume, train
 from ctm_plugin.scene.views import Scene, Views
 from ctm_plugin.splats import scales
 from ctm_plugin.splats.gaussians import Gaussians
-from ctm_plugin.splats.growth import Change
+from ctm_plugin.splats.growth import Change, along_curve
 from ctm_plugin.splats.render import bends
 
 SPLAT = ("backbone=splat", "trainer.image_every=null")
@@ -514,6 +514,30 @@ def test_it_grows_while_the_graph_of_an_earlier_step_lives(scene):
     assert state["step"] == 2
     assert len(state["exp_avg"]) == len(moments) + 4
     assert len(optimizers.state) == len(module.tables)
+
+
+def test_rows_that_stay_keep_their_moments_in_the_new_order(scene):
+    module = make(scene)
+    optimizers = module.configure_optimizers()
+    module.optimizers = lambda use_pl_optimizer: optimizers
+    stepped(module)
+    optimizers.step()
+    old = {
+        name: torch.cat([table.detach(), *(optimizers.state[table][each] for each in ("exp_avg", "exp_avg_sq"))], 1)
+        for name, table in module.tables.items()
+    }
+    kept = torch.arange(3, len(module.grad2d))
+    with torch.no_grad():
+        added = Gaussians(*(table[:7] + 5 for table in module.gaussians))
+        module._replace(Change(kept, added))
+    order = along_curve(module.tables["means"].detach())
+    assert order.tolist() == list(range(len(kept) + 7))
+    came = along_curve(torch.cat([old["means"][kept, :3], added.means]))
+    assert came.tolist() != sorted(came.tolist())
+    for name, table in module.tables.items():
+        state, fresh = optimizers.state[table], getattr(added, name)
+        new = torch.cat([old[name][kept], torch.cat([fresh, torch.zeros(7, 2 * fresh.shape[1])], 1)])[came]
+        assert torch.equal(torch.cat([table.detach(), state["exp_avg"], state["exp_avg_sq"]], 1), new)
 
 
 # Coarse to fine

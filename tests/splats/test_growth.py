@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from ctm_plugin.splats.gaussians import Gaussians, rotations
-from ctm_plugin.splats.growth import GROW_SCALE3D, SPLIT_FACTOR, Change, densify, shows
+from ctm_plugin.splats.growth import GROW_SCALE3D, SPLIT_FACTOR, Change, along_curve, densify, shows
 
 EXTENT = 5.0
 SMALL, WIDE = math.log(0.5 * GROW_SCALE3D * EXTENT), math.log(2.0 * GROW_SCALE3D * EXTENT)
@@ -110,3 +110,24 @@ def test_none_at_all():
 def test_some_stay_where_none_shows_enough():
     gaussians = some(3)._replace(opacities=torch.tensor([[-9.0], [-8.0], [math.nan]]))
     assert shows(gaussians, 0.005).tolist() == [True, True, False]
+
+
+# Their order
+
+
+def test_cubes_of_cells_lie_together():
+    """A lattice in any order, stretched along an axis, one place far out: each half, quarter, eighth stays together."""
+    side = torch.arange(8.0)
+    lattice = torch.cartesian_prod(side, side, side)[torch.randperm(512, generator=torch.Generator().manual_seed(0))]
+    places = lattice * torch.tensor([1.0, 1e3, 1e-3])
+    places[lattice.sum(1) == 21] *= 100
+    order = along_curve(places)
+    assert order.sort().values.tolist() == list(range(512))
+    for cube in (2, 4):
+        spans = lattice[order].long().div(cube, rounding_mode="floor").split(cube**3)
+        assert all((part == part[0]).all() for part in spans)
+
+
+@pytest.mark.parametrize("count", [0, 1, 3])
+def test_an_order_of_few(count):
+    assert along_curve(torch.zeros(count, 3)).tolist() == list(range(count))
