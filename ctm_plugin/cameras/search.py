@@ -205,7 +205,7 @@ def read_light(picture: PictureFile, size: int) -> Light:
     return Light(torch.cat([F.avg_pool2d(each[None, None], scale)[0, 0] for each in strips]), scale)
 
 
-def light_of(pixels: Pixels) -> Float32[Tensor, "*shape"]:
+def light_of(pixels: Pixels) -> Float32[Tensor, "*shape c"]:
     """Linear light of sRGB pixels; where they have 8 bits, by a table, in a tenth of the time."""
     return torch.from_numpy(LEVELS[pixels.numpy()]) if pixels.dtype == torch.uint8 else srgb_to_linear(pixels)
 

@@ -207,10 +207,10 @@ def _read(path: Path, decode: Decoder, _state: tuple[int, int] | None) -> Pictur
 def read_image(path: Path, decode: Decoder = open_picture) -> Float32[Tensor, "h w c"]:
     """Read a picture's pixels, see :meth:`PictureFile.image`."""
     with decode(path) as (header, pixels):
-        return upright(pixels(), header)
+        return unit(upright(pixels(), header))
 
 
-def upright(pixels: Float32[Tensor, "h w c"], header: Header) -> Float32[Tensor, "h w c"]:
+def upright(pixels: Pixels, header: Header) -> Tensor:
     """Turn stored pixels as their header says."""
     return torch.from_numpy(np.ascontiguousarray(turn(pixels.numpy(), header.orientation)))
 
