@@ -15,7 +15,7 @@ from ctm_plugin.color.transform import fitted
 from ctm_plugin.draws import Draws
 from ctm_plugin.runs.assemble import Parts
 
-BUDGET_STEPS = {"standard": 2300, "quick": 1500}
+BUDGET_STEPS = {"standard": 2500, "quick": 1500}
 """Number of training steps of splats by budget."""
 COLUMNS = {"standard": 300, "quick": 160}
 """Least width of pictures in pixels, by budget, for which the budget is worth its time."""

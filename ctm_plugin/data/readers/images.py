@@ -211,7 +211,7 @@ def read_image(path: Path, decode: Decoder = open_picture) -> Float32[Tensor, "h
 
 
 def upright(pixels: Pixels, header: Header) -> Tensor:
-    """Turn stored pixels as their header says."""
+    """Turn stored pixels ``[H, W, C]`` as their header says: ``[H, W, C]``, or ``[W, H, C]``."""
     return torch.from_numpy(np.ascontiguousarray(turn(pixels.numpy(), header.orientation)))
 
 
