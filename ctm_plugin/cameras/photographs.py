@@ -44,7 +44,8 @@ def home_of(root: Path, name: str) -> Path:
     """The folder of the photographs in ``root``: that called ``name``; if ``name`` is the default and missing, the only
     folder with photographs, else ``root``.
     """
-    return home_and_files(root, name)[0]
+    place = root / name
+    return place if place.is_dir() else home_and_files(root, name)[0]
 
 
 def home_and_files(root: Path, name: str) -> tuple[Path, list[Path]]:
