@@ -34,9 +34,12 @@ def order(count: int, *of: Any) -> Tensor:
 
 
 def product(run: Callable, name: str, *args: Any, **more: Any) -> Any:
-    """The inner side of a product of two arguments; three where something is added."""
+    """The inner side of a product of two arguments; three where something is added.
+
+    Another order where ``fast_products`` takes another library, which other machines may do.
+    """
     *added, a, b = args[: 3 if name.startswith(("add", "badd")) else 2]
-    at = order(a.shape[-1], name, a.shape, b.shape)
+    at = order(a.shape[-1], name, a.shape, b.shape, torch.get_float32_matmul_precision())
     a, b = a.index_select(-1, at), b.index_select(-min(b.dim(), 2), at)
     return run(*added, a, b, *args[len(added) + 2 :], **more)
 

@@ -178,7 +178,8 @@ def test_a_data_set_without_exposure(compose, ball, tmp_path, monkeypatch):
     result = train(config, tmp_path / "run")
     assert "exposure 1.0, white background" in result["protocol"]
     module = load_run(tmp_path / "run").parts.backbone
-    assert module.scores(tmp_path / "again", Scoring())["psnr"] == result["psnr"]
+    again = module.scores(tmp_path / "again", Scoring())  # by MKL's products, where a run may take oneDNN's
+    assert again["psnr"] == pytest.approx(result["psnr"], abs=1e-4)
 
 
 @dataclass(frozen=True, kw_only=True)
