@@ -85,7 +85,7 @@ def folders_of_clips(given: Path, pictures: str) -> dict[Path, Path]:
     clips = [path for path in files if is_clip(path)]
     live = [path for path in clips if fold(str(path.with_suffix(""))) in stills]
     if live:
-        line = f"{len(live)} clips with a still of the same name are left out, as {live[0].name!r}"
+        line = f"clips with a still of the same name left out: {len(live)}, as {live[0].name!r}"
         warnings.warn(f"{root}: {line}: Live Photos", stacklevel=3)
     folders: dict[Path, Path] = {}
     home = home_of(root, pictures)

@@ -68,14 +68,14 @@ def list_photographs(root: Path, name: str) -> list[Path]:
     place, files = home_and_files(root, name)
     paths = [path for path in files if is_picture(path)]
     for what, others in left_out(paths).items():
-        warnings.warn(f"{place}: {len(others)} {what} are left out, as {others[0].name!r}", stacklevel=2)
+        warnings.warn(f"{place}: {what} left out: {len(others)}, as {others[0].name!r}", stacklevel=2)
         paths = [path for path in paths if path not in others]
     if len(paths) < MIN_PICTURES:
         raise too_few(root, place, files, paths)
     known = (*IMAGE_SUFFIXES, *CLIP_SUFFIXES, *RAW_SUFFIXES)
     left = [path for path in files if path.suffix.lower() not in known and path.name not in SYSTEM_FILES]
     if left:
-        warnings.warn(f"{place}: {len(left)} other files are left out, as {left[0].name!r}", stacklevel=2)
+        warnings.warn(f"{place}: other files left out: {len(left)}, as {left[0].name!r}", stacklevel=2)
     return paths
 
 

@@ -99,7 +99,7 @@ def find_cameras(
             raise all_black(paths[0].parent, len(paths))
         sensors = [(header.lens, *sorted(header[:2])) for header in headers]
         if soft := unsharp([each.light.numpy() for each in lights], sensors):
-            say(f"{len(soft)} pictures far less sharp than their neighbours are left out, as {names[soft[0]]!r}")
+            say(f"pictures far less sharp than their neighbours left out: {len(soft)}, as {names[soft[0]]!r}")
             kept = [number for number in range(len(names)) if number not in soft]
             pictures, paths, headers, lights, names = (
                 [each[i] for i in kept] for each in (pictures, paths, headers, lights, names)

@@ -69,7 +69,7 @@ def test_what_came_with_a_still_is_left_out(walk):
     for name in ("IMG_0001.HEIC", "IMG_0002.JPG"):
         (walk.parent / name).write_bytes(b"still")
         walk.with_name(name).with_suffix(".MOV").write_bytes(walk.read_bytes())
-    with pytest.warns(UserWarning, match="2 clips with a still of the same name are left out, as 'IMG_0001.MOV'"):
+    with pytest.warns(UserWarning, match="clips with a still of the same name left out: 2, as 'IMG_0001.MOV'"):
         found = clips.folders_of_clips(walk.parent, "images")
     assert [*found] == [walk]
 

@@ -123,7 +123,7 @@ def test_what_is_told(dark, found):
     assert re.search(r"reprojection error +0\.\d\d pixels", found.stdout)
     assert f"written to {dark / 'sparse/0'}\n" in found.stdout
     assert found.stdout.endswith(f"next: ctm photos {dark}\n")
-    assert "1 other files are left out, as 'notes.txt'" in found.stderr
+    assert "other files left out: 1, as 'notes.txt'" in found.stderr
 
 
 @pytest.mark.slow

@@ -53,9 +53,9 @@ def test_what_is_none(capture):
         *shots, wide, *again, capture / "._IMG_1.jpg", capture / "Thumbs.db",
     }  # fmt: skip
     assert [str(each.message).removeprefix(f"{capture}: ") for each in caught] == [
-        "3 copies are left out, as 'IMG_1 (1).jpg'",
-        "2 screenshots are left out, as 'IMG_90.PNG'",
-        "1 panoramas are left out, as 'IMG_91.jpg'",
+        "copies left out: 3, as 'IMG_1 (1).jpg'",
+        "screenshots left out: 2, as 'IMG_90.PNG'",
+        "panoramas left out: 1, as 'IMG_91.jpg'",
     ]
 
 

@@ -76,7 +76,7 @@ def test_they_are_used_again_and_go_before_the_cameras_own_jpeg(night, capsys):
     for number in range(3):  # as if each showed something else
         path = night / "developed" / f"IMG_{number}.tif"
         path.write_bytes(path.read_bytes() + bytes(number))
-    with pytest.warns(UserWarning, match="1 copies are left out, as 'IMG_1.JPG'"):
+    with pytest.warns(UserWarning, match="copies left out: 1, as 'IMG_1.JPG'"):
         assert list_photographs(night, "images") == sorted(before)
 
 

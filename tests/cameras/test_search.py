@@ -89,7 +89,7 @@ def test_pictures_that_are_far_less_sharp_are_left_out(searched, monkeypatch, ca
     monkeypatch.setattr(search, "unsharp", lambda lights, sensors: [1])
     assert searched(GOOD)[0] == "good"
     said = capsys.readouterr().err
-    assert "1 pictures far less sharp than their neighbours are left out, as '" in said
+    assert "pictures far less sharp than their neighbours left out: 1, as '" in said
     assert "details: 3 of 3" in said
 
 
