@@ -38,6 +38,7 @@ from ctm_plugin.compose.compose import (
     elsewhere,
     explain,
     prepared,
+    warn_of_idle,
     without_hydras,
 )
 from ctm_plugin.cpu.threads import let_waiting_threads_sleep
@@ -60,6 +61,7 @@ MAIN_GROUPS = ("dataset", "backbone", "ctm", "trainer")
 
 def run(config: DictConfig) -> float | None:
     """Run one job, single or of a sweep; returns its PSNR, for sweepers that search, and raises what the job raises."""
+    from ctm_plugin.compose.checks import checked
     from ctm_plugin.compose.decide import decide
     from ctm_plugin.cpu.allocator import give_back
     from ctm_plugin.files import is_main_process
@@ -80,6 +82,7 @@ def run(config: DictConfig) -> float | None:
             raise ConfigError("sweep.resume", going_on, "false without -m: a single run goes on by resume=RUN_DIR")
         capture = decide(config)
         settings = without_hydras(config)
+        warn_of_idle(checked(settings, watched=False), job.overrides.task)
         if going_on:
             metrics = go_on(settings, Path(job.sweep.dir), folder, capture)
         else:

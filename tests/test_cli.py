@@ -300,3 +300,9 @@ def test_warnings_are_a_line_without_code(small, untrained, monkeypatch):
     assert main([*small]) == 1
     assert (warnings.formatwarning, threading.excepthook) == before
     assert told == ["warning: the cat is on the table\n", ""]  # once
+
+
+def test_a_setting_without_effect_is_named(small, monkeypatch):
+    monkeypatch.setattr("ctm_plugin.runs.train.train", lambda *_: {})
+    with pytest.warns(UserWarning, match="^backbone.steps=60 has no effect with backbone.coarse=false$"):
+        assert main([*small, "backbone.steps=60"]) == 0

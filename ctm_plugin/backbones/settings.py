@@ -12,6 +12,10 @@ COLOR_STARTS = ("mean", "grey")
 """A field's colours before its first step: the scene's mean, or the middle of the latent cube."""
 DVGO_GEOMETRIES = ("bounded", "forward")
 """Geometries that DVGO trains on."""
+COARSE, ALONE = {"coarse": (True, "auto")}, {"coarse": (False, "auto")}
+"""Values of ``coarse`` with which DVGO's settings of a coarse stage have an effect, and those of a run without one."""
+BARF = {"encoding": ("barf",)}
+"""Values of ``encoding`` with which settings of BARF's schedule have an effect."""
 SQUARES = tuple(side * side for side in range(1, 17))
 """Numbers that are a square of an integer: pixels of an averaging square."""
 
@@ -69,10 +73,10 @@ class DVGOConfig(FieldConfig):
         "whether a coarse stage comes first: true, false, or auto (on bounded scenes with alpha that are not dark)",
         choices=(True, False, "auto"),
     )
-    coarse_steps: int = setting(5000, "steps of the coarse stage", least=1)
-    coarse_voxels: int = setting(100**3, "voxels of the coarse grid", least=8)
-    steps: int = setting(20000, "steps of the fine stage when a coarse stage comes first", least=1)
-    steps_alone: int = setting(30000, "steps of the fine stage when there is no coarse stage", least=1)
+    coarse_steps: int = setting(5000, "steps of the coarse stage", least=1, only=COARSE)
+    coarse_voxels: int = setting(100**3, "voxels of the coarse grid", least=8, only=COARSE)
+    steps: int = setting(20000, "steps of the fine stage when a coarse stage comes first", least=1, only=COARSE)
+    steps_alone: int = setting(30000, "steps of the fine stage when there is no coarse stage", least=1, only=ALONE)
     voxels: int = by_geometry(160**3, 256**3, "voxels of the fine grid at its full size", least=8)
     grow: tuple[int, ...] = by_geometry(
         (1000, 2000, 3000, 4000),
@@ -95,7 +99,7 @@ class DVGOConfig(FieldConfig):
     step_size: float = setting(
         0.5, "distance between samples on a ray, in voxels (bounded) or planes (forward)", above=0
     )
-    coarse_lr_grid: float = setting(0.1, "learning rate of the coarse stage's grids", above=0)
+    coarse_lr_grid: float = setting(0.1, "learning rate of the coarse stage's grids", above=0, only=COARSE)
     lr_grid: float = setting(0.1, "learning rate of the fine stage's grids", above=0)
     lr_mlp: float = setting(1e-3, "learning rate of the fine stage's colour network", above=0)
     lr_decay_steps: int | None = setting(
@@ -104,20 +108,31 @@ class DVGOConfig(FieldConfig):
         least=1,
     )
     lr_final: float = setting(
-        0.1, "factor that learning rates fall to after lr_decay_steps, when a coarse stage comes first", above=0
+        0.1,
+        "factor that learning rates fall to after lr_decay_steps, when a coarse stage comes first",
+        above=0,
+        only=COARSE,
     )
     lr_final_alone: float = setting(
-        0.1, "factor that learning rates fall to after lr_decay_steps, when there is no coarse stage", above=0
+        0.1,
+        "factor that learning rates fall to after lr_decay_steps, when there is no coarse stage",
+        above=0,
+        only=ALONE,
     )
     coarse_entropy: float = setting(
-        0.01, "weight of the background entropy, which makes rays opaque or empty, in the coarse stage", least=0
+        0.01,
+        "weight of the background entropy, which makes rays opaque or empty, in the coarse stage",
+        least=0,
+        only=COARSE,
     )
     occupancy_first: int = setting(
         500,
         "step of the fine stage at which empty space is first looked for, then at 2, 4, 8, ... times that step",
         least=1,
     )
-    planes: int = setting(128, "planes of voxels on scenes with geometry=forward", least=2)
+    planes: int = setting(
+        128, "planes of voxels on scenes with geometry=forward", least=2, only={"geometry": ("forward",)}
+    )
     tv_density: float = by_geometry(
         0.0, 1e-5, "weight of the density grid's total variation in the fine stage", least=0
     )
@@ -336,9 +351,15 @@ class BARF2DConfig(Settings, section="backbone"):
     lr: float = setting(1e-3, "learning rate of the network", above=0)
     lr_warp: float = setting(1e-3, "learning rate of the homographies", above=0)
     start: float = setting(
-        0.0, "share of the training after which encoding=barf begins to bring the frequencies in", least=0, below=1
+        0.0,
+        "share of the training after which encoding=barf begins to bring the frequencies in",
+        least=0,
+        below=1,
+        only=BARF,
     )
-    end: float = setting(0.4, "share of the training after which encoding=barf has all frequencies in", above=0, most=1)
+    end: float = setting(
+        0.4, "share of the training after which encoding=barf has all frequencies in", above=0, most=1, only=BARF
+    )
     shifts_until: float = setting(
         0.0,
         "share of the training in which patches are only shifted; afterwards they also turn, shear and tilt",

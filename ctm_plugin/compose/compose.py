@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import errno
 import os
-from collections.abc import Iterable, Sequence
+import warnings
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
@@ -23,7 +24,7 @@ from ctm_plugin.settings.as_typed import grammar, is_sweep
 from ctm_plugin.settings.build import SECTIONS, unknown_choice, unknown_key
 from ctm_plugin.settings.listing import names
 from ctm_plugin.settings.registry import REGISTRIES, conf_dir
-from ctm_plugin.settings.setting import keys
+from ctm_plugin.settings.setting import idle, keys
 
 ROOT_KEYS = (*SECTIONS, "resume", "seed", "sweep", "hydra")
 """Keys at the top of a configuration."""
@@ -90,6 +91,20 @@ def check_values(config: DictConfig, arguments: Sequence[str]) -> None:
         if not is_sweep(arguments):
             checked(settings)
     refuse_several(arguments)
+
+
+def warn_of_idle(settings: Mapping[str, Any], arguments: Iterable[str]) -> None:
+    """Warn of keys on a command line that have no effect with the other settings of their section.
+
+    Args:
+        settings: what :func:`ctm_plugin.compose.checks.checked` built.
+        arguments: one run's choices and keys.
+    """
+    given = {each.key_or_group: each.input_line for each in parsed(arguments)}
+    for section in settings.keys() - {"callbacks"}:
+        for name, why in idle(settings[section]).items():
+            if line := given.get(f"{section}.{name}"):
+                warnings.warn(f"{line} has no effect with {section}.{why}", stacklevel=2)
 
 
 def at_work(folder: str | Path | None = None) -> AbstractContextManager[None]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
+from collections.abc import Mapping, Sequence
 from dataclasses import MISSING, Field, dataclass, field, fields, is_dataclass
 from types import NoneType
 from typing import Any, ClassVar, NamedTuple, get_args, get_type_hints
@@ -60,20 +61,24 @@ class Allowed(NamedTuple):
         return f"{what} in {ends[0]}{self.low:.10g}, {self.high:.10g}{ends[1]}"
 
 
-def setting(default: Any, meaning: str, *, composed: str | None = None, **allowed: Any) -> Any:
+def setting(
+    default: Any, meaning: str, *, composed: str | None = None, only: Mapping[str, Sequence[Any]] | None = None,
+    **allowed: Any,
+) -> Any:  # fmt: skip
     """Make a dataclass's field with its default, meaning and allowed values.
 
     Args:
         default: a value that cannot be changed, or ``REQUIRED``.
         meaning: a phrase that can be understood on its own, at most 25 words.
         composed: the default on a command line, an interpolation, where it depends on other keys.
+        only: other fields, and the values of each with which this one has an effect, see :func:`idle`.
         allowed: ``least`` and ``most`` of a number, ends that count, or ``above`` and ``below``, ends that do not;
             ``choices``, in place of numbers or besides them. ``null`` is allowed where the type has ``None``. An
             integer has at most 31 bits. TypeError: another rule.
     """
     if unknown := set(allowed) - set(RULES):
         raise TypeError(f"setting() got {', '.join(sorted(unknown))}, expected some of {', '.join(RULES)}")
-    metadata = {"meaning": meaning, "composed": composed, "allowed": allowed}
+    metadata = {"meaning": meaning, "composed": composed, "only": only, "allowed": allowed}
     return field(default=default, metadata={name: value for name, value in metadata.items() if value})
 
 
@@ -156,6 +161,17 @@ def meanings(settings: type) -> dict[str, str]:
         texts |= {f"{each.name}.{name}": ": ".join(filter(None, (meaning, words))) for name, words in inner.items()}
         texts |= {} if inner else {each.name: meaning}
     return texts
+
+
+def idle(settings: Any) -> dict[str, str]:
+    """Find the fields that have no effect, by name, each with the reason: ``other=value``, another field's value."""
+    only = {each.name: _said(type(settings), each.name, "only") or {} for each in fields(settings)}
+    return {
+        name: f"{other}={str(value).lower()}"
+        for name, needed in only.items()
+        for other, values in needed.items()
+        if (value := getattr(settings, other)) not in values
+    }
 
 
 def keys(settings: type) -> list[str]:

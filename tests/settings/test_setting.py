@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from ctm_plugin.errors import ConfigError
 from ctm_plugin.settings.registry import PRESET_SETTINGS, REGISTRIES, load
-from ctm_plugin.settings.setting import MAX_INT, Settings, meanings, rules, setting
+from ctm_plugin.settings.setting import MAX_INT, Settings, idle, meanings, rules, setting
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -20,6 +20,7 @@ class Thing(Settings, section="thing"):
     rate: float = setting(1.0, "how fast", above=0)
     level: float | str | None = setting(None, "how bright", least=0, below=1, choices=("scene",))
     either: bool | str = setting("auto", "whether", choices=(True, False, "auto"))
+    then: int = setting(1, "how often, if so", least=1, only={"either": (True, "auto")})
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,6 +74,11 @@ def test_a_field_that_is_given_again_keeps_what_it_does_not_say():
         Special(share=2)
     with pytest.raises(ConfigError, match=r"thing\.either: found True, expected one of auto"):
         Special(either=True)
+
+
+def test_what_has_no_effect_is_known():
+    assert idle(Thing()) == idle(Thing(either=True)) == {}
+    assert idle(Thing(either=False)) == {"then": "either=false"}
 
 
 def test_a_rule_that_is_misspelt():
