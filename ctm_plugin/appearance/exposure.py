@@ -92,7 +92,8 @@ def log_exposures(start: str, views: Views) -> Float[Tensor, " n"]:
     """Natural logarithms of the pictures' exposures, up to one common offset.
 
     Args:
-        start: one of :data:`STARTS`; ``light`` takes the mean linear light of all pixels that count.
+        start: ``same``, ``light`` or ``exif``. ``light`` takes the views' ``gains``; where a picture has none, the mean
+            linear light of all pixels that count.
         views: the pictures.
 
     Raises:
@@ -111,4 +112,5 @@ def log_exposures(start: str, views: Views) -> Float[Tensor, " n"]:
         pixels = image if views.mask is None else image[views.mask[index]]
         pixels = pixels[pixels[..., 3] > 0] if views.has_alpha else pixels
         means.append(srgb_to_linear(unit(pixels[..., :3])).mean() if len(pixels) else torch.tensor(MIN_MEAN_LIGHT))
-    return torch.stack(means).float().cpu().clamp(min=MIN_MEAN_LIGHT).log()
+    light, gains = torch.stack(means).float().cpu().clamp(min=MIN_MEAN_LIGHT).log(), views.gains
+    return light if gains is None else gains.where(gains.isfinite(), light + (gains - light).nanmedian())

@@ -13,8 +13,8 @@ class ExposureConfig(Settings, section="appearance"):
 
     start: str = setting(
         "light",
-        "exposures before the first step: same (one for all), light (each picture's mean light), exif (time x ISO "
-        "/ f-number², from EXIF)",
+        "exposures before the first step: same, light (of points that several pictures see, else each picture's mean), "
+        "exif (time x ISO / f-number², from EXIF)",
         choices=("same", "light", "exif"),
     )
     fixed: bool = setting(False, "keep the exposures as they start")

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import lightning as L
 
+from ctm_plugin.appearance.gains import gains_by_points
 from ctm_plugin.backbones.base import Backbone
 from ctm_plugin.color.photometric import Photometric
 from ctm_plugin.color.transform import Chain, ColorTransform
@@ -77,7 +78,8 @@ def assemble(
     if trainer.minutes is not None and module.pace is None:
         raise ConfigError("trainer.minutes", trainer.minutes, f"null: backbone={name} takes all its steps")
     if shares != "none":
-        module.appearance = APPEARANCES.get(shares)(given["appearance"], scene.train)
+        views = replace(scene.train, gains=gains_by_points(scene))
+        module.appearance = APPEARANCES.get(shares)(given["appearance"], views)
     return Parts(scene, module, trainer, given["metrics"], *observers)
 
 

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from jaxtyping import Bool, Float, Float32
+from scipy.sparse import csr_array
 from torch import Tensor
 
 from ctm_plugin.scene.views import Pixels, unit
@@ -43,20 +45,26 @@ def area(image: Pixels, height: int, width: int) -> Float32[Tensor, "h2 w2 c"]:
     if down == across and down.is_integer():
         strips = image.split(STRIP * int(down))
         return torch.cat([F.avg_pool2d(unit(each).permute(2, 0, 1), int(down)).permute(1, 2, 0) for each in strips])
-    return area_of_rows(area_of_rows(image, height).transpose(0, 1), width).transpose(0, 1).clamp(max=1.0)
+    rows, columns = (parts(*sides) for sides in zip(image.shape[:2], (height, width), strict=True))
+    small = torch.empty(height, width, image.shape[2])
+    for begin in range(0, height, STRIP):
+        some = rows[begin : begin + STRIP]
+        low, high = some.indices.min(), some.indices.max() + 1
+        strip = (some[:, low:high] @ unit(image[low:high]).flatten(1).numpy()).reshape(-1, *image.shape[1:])
+        strip = columns @ strip.swapaxes(0, 1).reshape(image.shape[1], -1)
+        small[begin : begin + STRIP] = torch.from_numpy(strip.reshape(width, -1, image.shape[2])).transpose(0, 1)
+    return small.clamp(max=1.0)
 
 
-def area_of_rows(image: Pixels, height: int) -> Float32[Tensor, "h2 w c"]:
-    """Means over ``height`` equal parts of a picture's rows."""
-    count = len(image)
-    edges = torch.arange(height + 1, dtype=torch.float64) * count / height
-    low, high, first = edges[:-1], edges[1:], edges[:-1].long()
-    total = torch.zeros(height, *image.shape[1:])
-    for step in range(math.ceil(count / height) + 1):
-        row = first + step
-        part = (torch.minimum(high, row + 1) - torch.maximum(low, row)).clamp(min=0) * height / count
-        total += part.float()[:, None, None] * unit(image[row.clamp(max=count - 1)])
-    return total
+def parts(count: int, few: int) -> csr_array:
+    """Weights ``[few, count]`` of means over ``few`` equal parts of ``count`` pixels."""
+    edges = np.arange(few + 1) * count / few
+    low, high, pixel = edges[:-1, None], edges[1:, None], np.arange(math.ceil(count / few) + 1)
+    pixel = np.floor(low).astype(int) + pixel
+    part = (np.minimum(high, pixel + 1) - np.maximum(low, pixel)).clip(min=0) * few / count
+    row = np.arange(few).repeat(pixel.shape[1])
+    places = (row, pixel.clip(max=count - 1).ravel())
+    return csr_array((part.ravel().astype(np.float32), places), (few, count))
 
 
 def shrink_mask(mask: Bool[Tensor, "h w"], height: int, width: int) -> Bool[Tensor, "h2 w2"]:

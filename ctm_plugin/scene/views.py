@@ -42,6 +42,8 @@ class Views:
             is trained on or fitted to. ``None``: there are none.
         exposures: ``[N]``, the light that each training picture took by its EXIF, up to one factor; NaN where it does
             not tell. ``None``: none tells.
+        gains: ``[N]``, natural logarithms of the training pictures' gains, by the light of points, up to one offset;
+            NaN: too few points. ``None``: not measured.
         sizes: ``[N, 2]`` height and width of pictures that differ, each in the upper left corner of its image;
             ``None``: all fill theirs.
     """
@@ -56,6 +58,7 @@ class Views:
     pictured: Bool[Tensor, " n"] | None = field(default=None, metadata=ADDED)
     lit: UInt8[Tensor, "n h w 3"] | None = field(default=None, metadata=ADDED)
     exposures: Float32[Tensor, " n"] | None = field(default=None, metadata=ADDED)
+    gains: Float32[Tensor, " n"] | None = field(default=None, metadata=DERIVED)
     sizes: Int64[Tensor, "n 2"] | None = field(default=None, metadata=DERIVED)
 
     def __len__(self) -> int:

@@ -16,7 +16,7 @@ from ctm_plugin.compose.decide import composites_there, has_gpu
 from ctm_plugin.data.readers.clip import CLIP_SUFFIXES
 from ctm_plugin.data.readers.folders import is_picture, require_folder
 from ctm_plugin.data.readers.images import read_picture
-from ctm_plugin.data.readers.layouts import layouts
+from ctm_plugin.data.readers.layouts import layouts, model_folder
 from ctm_plugin.errors import CheckpointError, ConfigError, DataError
 from ctm_plugin.export.settings import VideoConfig
 from ctm_plugin.runs.rundir import ALL, CONFIG, METRICS, PAGE, film_of, load_config
@@ -193,21 +193,24 @@ def choices(root: Path, minutes: float, others: Sequence[str], say: Callable[[st
     """Choose the layout, the pictures' width and the budget, and print them; keys that are given stay."""
     import torch
 
-    from ctm_plugin.cameras.exposures import UNEVEN, spread_of_gains
-    from ctm_plugin.runs.assemble import assemble
+    from ctm_plugin.appearance.gains import SIZE, UNEVEN, gains_by_points
+    from ctm_plugin.runs.assemble import assemble, load_scene
     from ctm_plugin.workflows.plan import REFERENCE, TIMED_COLUMNS, plan, timed_steps
 
     layout = layouts(root)[0]
     chosen = {"dataset": layout, "dataset.root": root.resolve(), "ctm": "auto"}
     given = {other.partition("=")[0].lstrip("+") for other in others}
-    if not any(key.startswith("appearance") for key in given) and (spread := spread_of_gains(root)) > UNEVEN:
-        chosen["appearance"] = "exposure"
-        say(f"appearance=exposure: the photographs' exposures spread by {spread:.0%}")
     config = compose(*_overrides(chosen, given), "trainer=smoke", *others)
     dataset = {key: value for key, value in config["dataset"].items() if key != "name"}
     rig = build(DATASETS.get(layout), dataset, "dataset").rig()
     chosen["dataset.geometry"] = dataset["geometry"]
     sized = given & {"dataset.width", "dataset.downscale", "dataset.factor"}
+    if model_folder(root) and not any(key.startswith("appearance") for key in given):
+        small = {} if sized else {"dataset.width": min(SIZE, rig.size[1])}
+        gains = gains_by_points(load_scene(compose(*_overrides(chosen | small, given), "trainer=smoke", *others)))
+        if gains is not None and (spread := float(gains[gains.isfinite()].std(correction=0))) > UNEVEN:
+            chosen["appearance"] = "exposure"
+            say(f"appearance=exposure, started at the points' light: the photographs' exposures spread by {spread:.0%}")
     timed = config["backbone"]["name"] == TIMED_BACKBONE and not given & LENGTH_KEYS
     step = None if has_gpu() and composites_there() else REFERENCE
     if timed and step is not None:

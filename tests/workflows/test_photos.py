@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 
 from ctm_plugin.cli import main
@@ -148,11 +149,14 @@ def test_photographs_that_were_added_are_searched_anew(capture, monkeypatch, cap
     [(0.3, (), True), (0.04, (), False), (0.3, ("appearance=none",), False), (0.3, ("+appearance=none",), False)],
 )
 def test_uneven_photographs_are_evened_unless_told_otherwise(capture, monkeypatch, spread, more, expected):
-    monkeypatch.setattr("ctm_plugin.cameras.exposures.spread_of_gains", lambda root: spread)
+    gains = torch.tensor([spread, -spread, torch.nan])
+    monkeypatch.setattr("ctm_plugin.workflows.photos.model_folder", lambda root: root)
+    monkeypatch.setattr("ctm_plugin.appearance.gains.gains_by_points", lambda scene: gains)
     said = []
     chosen = choices(capture, 1.0, [*SMALL, *more], said.append)
     assert ("appearance=exposure" in chosen) == expected
-    assert ("appearance=exposure: the photographs' exposures spread by 30%" in said) == expected
+    line = "appearance=exposure, started at the points' light: the photographs' exposures spread by 30%"
+    assert (line in said) == expected
 
 
 def test_runs_that_cannot_be_written_are_refused_before_cameras_are_searched(tmp_path, monkeypatch, capsys):
