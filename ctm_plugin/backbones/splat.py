@@ -264,6 +264,9 @@ class Splat(PictureBackbone):
             self.side = side
             self.cameras.clear()
             self.learn_from(self.scene.train if side == 1 else averaged(self.scene.train, side))
+        # By the schedule: what `self.side` was says nothing in a run that is gone on with.
+        if self.between_steps and step and self.side != self.side_at(self.pace.place(step - 1)):
+            self._forget(*self.tables.values())
         grows = self.pace.passes(step, config.grow_every) and self.scheduled >= config.grow_from
         if self.between_steps and grows:
             self._grow(step)
@@ -301,9 +304,14 @@ class Splat(PictureBackbone):
         """Make all Gaussians nearly transparent: those that the pictures need regain opacity, floaters do not."""
         table = self.tables["opacities"]
         table.clamp_(max=math.log(RESET_OPACITY / (1 - RESET_OPACITY)))
-        for moment in self.named_optimizers.state.get(table, {}).values():
-            if isinstance(moment, Tensor):
-                moment.zero_()
+        self._forget(table)
+
+    def _forget(self, *tables: Tensor) -> None:
+        """Put Adam's moments to zero, as new Gaussians have them: steps are large until the second one has grown."""
+        for table in tables:
+            for moment in self.named_optimizers.state.get(table, {}).values():
+                if isinstance(moment, Tensor):
+                    moment.zero_()
 
     def stats(self) -> dict[str, float]:
         return {"gaussians": float(len(self.grad2d))}
