@@ -20,7 +20,7 @@ import torch
 from turns import Turns, answer
 
 from ctm_plugin.backbones.barf2d import BARF2D
-from ctm_plugin.compose.compose import compose
+from ctm_plugin.compose.command_line import compose
 from ctm_plugin.cpu.allocator import keep_memory
 from ctm_plugin.runs.assemble import assemble
 

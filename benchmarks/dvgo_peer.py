@@ -27,7 +27,7 @@ from turns import Turns, answer, view_psnr
 
 from ctm_plugin.backbones.dvgo import DVGO
 from ctm_plugin.backbones.voxels import VoxelField
-from ctm_plugin.compose.compose import compose
+from ctm_plugin.compose.command_line import compose
 from ctm_plugin.cpu.allocator import keep_memory
 from ctm_plugin.draws import Draws
 from ctm_plugin.rays.cameras import Rays

@@ -20,7 +20,7 @@ from turns import Turns, answer, view_psnr
 
 from ctm_plugin.backbones.nerf import NeRF
 from ctm_plugin.backbones.nerf_field import NeRFField
-from ctm_plugin.compose.compose import compose
+from ctm_plugin.compose.command_line import compose
 from ctm_plugin.cpu.allocator import keep_memory
 from ctm_plugin.runs.assemble import assemble
 

@@ -21,7 +21,7 @@ import torch
 from turns import SIDES, Turns, answer, view_psnr
 
 from ctm_plugin.backbones.ngp import NGP
-from ctm_plugin.compose.compose import compose
+from ctm_plugin.compose.command_line import compose
 from ctm_plugin.cpu.allocator import keep_memory
 from ctm_plugin.rays.cameras import Rays
 from ctm_plugin.runs.assemble import assemble

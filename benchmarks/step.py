@@ -36,7 +36,7 @@ from torch.profiler import ProfilerActivity, profile, record_function
 from ctm_plugin.backbones.base import Backbone
 from ctm_plugin.callbacks.stopwatch import peak_memory_mb, synchronise
 from ctm_plugin.color.transform import ColorTransform, fitted
-from ctm_plugin.compose.compose import compose, explain
+from ctm_plugin.compose.command_line import compose, explain
 from ctm_plugin.cpu.allocator import keep_memory
 from ctm_plugin.cpu.products import fast_products
 from ctm_plugin.errors import ConfigError, CTMError

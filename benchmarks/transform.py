@@ -11,7 +11,7 @@ import lightning as L
 import torch
 from torch import Tensor
 
-from ctm_plugin.compose.compose import compose
+from ctm_plugin.compose.command_line import compose
 from ctm_plugin.draws import Draws
 from ctm_plugin.runs.assemble import assemble
 

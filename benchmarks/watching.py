@@ -17,7 +17,7 @@ from pathlib import Path
 from ctm_plugin.backbones.base import Backbone
 from ctm_plugin.callbacks.dashboard import Dashboard
 from ctm_plugin.callbacks.progress import ProgressLine
-from ctm_plugin.compose.compose import compose
+from ctm_plugin.compose.command_line import compose
 from ctm_plugin.runs.train import train
 
 

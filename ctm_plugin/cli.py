@@ -28,7 +28,7 @@ from rich.console import Console
 
 from ctm_plugin import __version__
 from ctm_plugin.compose.choices import register, told, with_fitting_dataset
-from ctm_plugin.compose.compose import (
+from ctm_plugin.compose.command_line import (
     GROUPS,
     at_work,
     check,

@@ -15,7 +15,7 @@ from ctm_plugin.backbones.splat import Splat
 from ctm_plugin.color.photometric import Photometric
 from ctm_plugin.color.prepare import adam_of, prepare
 from ctm_plugin.color.transform import ColorTransform
-from ctm_plugin.compose.compose import compose, conf_dir, explain
+from ctm_plugin.compose.command_line import compose, conf_dir, explain
 from ctm_plugin.errors import ConfigError, CTMError
 from ctm_plugin.export.splats import TRAIN_STEPS, plain
 from ctm_plugin.runs.assemble import color_transform

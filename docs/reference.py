@@ -22,7 +22,7 @@ sys.path.append(str(Path(__file__).resolve().parent / "examples" / "ctm_scenes")
 from ctm_scenes.settings import VERB
 
 from ctm_plugin.compose import choices
-from ctm_plugin.compose.compose import GROUPS, conf_dir
+from ctm_plugin.compose.command_line import GROUPS, conf_dir
 from ctm_plugin.data.settings import FolderConfig
 from ctm_plugin.metrics.table import METRICS
 from ctm_plugin.settings import commands, listing

@@ -203,7 +203,7 @@ def installed(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Path]
     """The package in ``tests/outside``, on the path and found by its metadata as an installed one is, for one test."""
     from hydra.core.config_store import ConfigStore
 
-    from ctm_plugin.compose.compose import GROUPS
+    from ctm_plugin.compose.command_line import GROUPS
     from ctm_plugin.metrics import table
 
     folder = Path(__file__).parent / "outside"
@@ -221,7 +221,7 @@ def installed(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Path]
 
 @functools.cache
 def _configuration(*arguments: str) -> dict[str, Any]:
-    from ctm_plugin.compose.compose import compose
+    from ctm_plugin.compose.command_line import compose
 
     return compose(*arguments)
 

@@ -116,7 +116,7 @@ class Killer:
 
 
 def main() -> int:
-    from ctm_plugin.compose.compose import compose
+    from ctm_plugin.compose.command_line import compose
 
     parser = argparse.ArgumentParser()
     parser.add_argument("--kills", type=int, default=50)

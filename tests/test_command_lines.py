@@ -28,7 +28,7 @@ from pages import PAGES, ROOT
 from tensorboard.program import TensorBoard
 
 from ctm_plugin import cli
-from ctm_plugin.compose.compose import GROUPS, compose, conf_dir
+from ctm_plugin.compose.command_line import GROUPS, compose, conf_dir
 from ctm_plugin.cpu import allocator
 from ctm_plugin.runs import assemble, rundir, sweep, train
 from ctm_plugin.settings import listing, registry

@@ -13,8 +13,8 @@ from ctm_plugin import cli
 from ctm_plugin.color.settings import LossWeights
 from ctm_plugin.compose import choices as choices_of
 from ctm_plugin.compose.checks import checked, kind_of, own
-from ctm_plugin.compose.compose import GROUPS, conf_dir
-from ctm_plugin.compose.compose import compose as program_compose
+from ctm_plugin.compose.command_line import GROUPS, conf_dir
+from ctm_plugin.compose.command_line import compose as program_compose
 from ctm_plugin.runs.assemble import color_transform
 from ctm_plugin.settings.listing import choices
 from ctm_plugin.settings.registry import BACKBONES, DATASETS, REGISTRIES
@@ -70,7 +70,7 @@ LINES = [[], ["experiment=table3", "seed=4"], ["backbone=nerf", "trainer=paper",
 @pytest.mark.slow
 def test_what_tests_compose_is_what_hydra_does(composed, tmp_path):
     """``composing.py`` leaves other processes alone."""
-    script = "import json; from ctm_plugin.compose.compose import compose; "
+    script = "import json; from ctm_plugin.compose.command_line import compose; "
     script += f"print(json.dumps([compose(*a) for a in {LINES}]))"
     process = Command(script, main=execute, told=tmp_path / "told")
     output, error = process.communicate()

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 import ctm_plugin
-from ctm_plugin.compose.compose import conf_dir
+from ctm_plugin.compose.command_line import conf_dir
 
 pytestmark = pytest.mark.slow
 

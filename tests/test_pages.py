@@ -5,7 +5,7 @@ import re
 import pytest
 from pages import FENCE, LINK, PAGES, ROOT, SPAN, by_hand, name_of, prose
 
-from ctm_plugin.compose.compose import GROUPS
+from ctm_plugin.compose.command_line import GROUPS
 
 BUDGETS = {
     "README.md": 590,

@@ -8,7 +8,7 @@ from omegaconf import DictConfig, OmegaConf
 from pages import load
 
 from ctm_plugin.compose.choices import node
-from ctm_plugin.compose.compose import GROUPS, conf_dir
+from ctm_plugin.compose.command_line import GROUPS, conf_dir
 from ctm_plugin.settings.commands import explained
 from ctm_plugin.settings.listing import choices
 

@@ -109,7 +109,7 @@ VERBS = {
     ),
     "export": Verb(
         "write a run's splats, points, mesh or cameras for other programs", "RUN_DIR",
-        "ctm_plugin.export.export:export", "ctm_plugin.export.settings:ExportConfig",
+        "ctm_plugin.export.command:export", "ctm_plugin.export.settings:ExportConfig",
     ),
     "view": Verb(
         "look around in runs in the browser", "RUN_DIR ...", "ctm_plugin.view.command:view",

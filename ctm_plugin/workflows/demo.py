@@ -14,7 +14,7 @@ from PIL import Image
 from rich.console import Console
 from rich.table import Table
 
-from ctm_plugin.compose.compose import compose
+from ctm_plugin.compose.command_line import compose
 from ctm_plugin.data.readers.images import to_8_bits
 from ctm_plugin.export.page import html, picture_url
 from ctm_plugin.files import write_text

@@ -11,7 +11,7 @@ from ctm_plugin.cameras.clips import root_of, take_frames
 from ctm_plugin.cameras.photographs import PICTURE_SUFFIXES, added, home_and_files, list_photographs
 from ctm_plugin.cameras.raws import develop_raws
 from ctm_plugin.cameras.settings import DEFAULT_FOLDER, CamerasConfig
-from ctm_plugin.compose.compose import compose
+from ctm_plugin.compose.command_line import compose
 from ctm_plugin.compose.decide import composites_there, has_gpu
 from ctm_plugin.data.readers.clip import CLIP_SUFFIXES
 from ctm_plugin.data.readers.folders import is_picture, require_folder
@@ -60,7 +60,7 @@ def photos(folder: Path, settings: PhotosConfig, others: Sequence[str] = ()) -> 
             read_picture(path)
     # These take seconds to import: what lies in the folder is refused before.
     from ctm_plugin.cameras.command import place, tell
-    from ctm_plugin.export.export import write_views
+    from ctm_plugin.export.command import write_views
     from ctm_plugin.export.page import write_page
     from ctm_plugin.export.video import film
     from ctm_plugin.runs.load import load_posed

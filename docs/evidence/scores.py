@@ -18,7 +18,7 @@ from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
-from ctm_plugin.compose.compose import compose
+from ctm_plugin.compose.command_line import compose
 from ctm_plugin.errors import CTMError, DataError
 from ctm_plugin.files import write_text
 from ctm_plugin.metrics.table import METRICS

@@ -129,7 +129,7 @@ def outcomes(
 
     Runs are found by their configuration, as when a sweep goes on: their folders may have other numbers.
     """
-    from ctm_plugin.compose.compose import without_hydras
+    from ctm_plugin.compose.command_line import without_hydras
     from ctm_plugin.runs.sweep import finished, same_run
 
     common = set.intersection(*(set(job) for job in jobs)) if len(jobs) > 1 else set()

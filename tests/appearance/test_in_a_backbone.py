@@ -8,7 +8,7 @@ import torch
 from ctm_plugin.appearance.exposure import Exposure
 from ctm_plugin.color.light import find_light
 from ctm_plugin.color.srgb import linear_to_srgb, srgb_to_linear
-from ctm_plugin.compose.compose import compose as composed_anew
+from ctm_plugin.compose.command_line import compose as composed_anew
 from ctm_plugin.draws import Draws
 from ctm_plugin.errors import ConfigError
 from ctm_plugin.runs.assemble import assemble

@@ -12,7 +12,7 @@ from faults import checkpoint, differences
 from torch import Tensor, nn
 
 from ctm_plugin.backbones.pictures import PictureBackbone, RenderedView
-from ctm_plugin.compose.compose import compose as composed_anew
+from ctm_plugin.compose.command_line import compose as composed_anew
 from ctm_plugin.draws import Draws
 from ctm_plugin.errors import Interrupted
 from ctm_plugin.runs.assemble import Parts, assemble

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from ctm_plugin.color.auto import Auto, toe
 from ctm_plugin.color.settings import AutoConfig
 from ctm_plugin.color.srgb import linear_to_srgb
-from ctm_plugin.compose.compose import compose
+from ctm_plugin.compose.command_line import compose
 from ctm_plugin.errors import ConfigError
 from ctm_plugin.settings.registry import COLOR_SPACES
 

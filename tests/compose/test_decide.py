@@ -10,7 +10,7 @@ from PIL import Image
 
 from ctm_plugin.cli import main
 from ctm_plugin.compose import decide
-from ctm_plugin.compose.compose import compose
+from ctm_plugin.compose.command_line import compose
 from ctm_plugin.data.blender import BlenderConfig
 from ctm_plugin.data.llff import LLFFConfig
 from ctm_plugin.data.readers import records as reading

@@ -23,7 +23,7 @@ from ctm_plugin.data.blender import BlenderConfig
 from ctm_plugin.data.llff import LLFFConfig
 from ctm_plugin.data.transforms import TransformsConfig
 from ctm_plugin.errors import CTMError
-from ctm_plugin.export.export import write_cameras, write_surface
+from ctm_plugin.export.command import write_cameras, write_surface
 from ctm_plugin.export.surface import LAYER_THICKNESS, Surface, cloud, mesh
 from ctm_plugin.rays.cameras import Rays, pixel_rays
 from ctm_plugin.scene.views import Scene

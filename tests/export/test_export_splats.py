@@ -121,7 +121,7 @@ def run(tmp_path_factory) -> Path:
 
 @pytest.mark.slow
 def test_lit_splats_from_the_command_line(run, capsys, refused, tmp_path, monkeypatch):
-    monkeypatch.setattr("ctm_plugin.export.export.TRAIN_STEPS", 100)
+    monkeypatch.setattr("ctm_plugin.export.command.TRAIN_STEPS", 100)
     assert main(["export", str(run)]) == 0
     file, told = run / "export/splats.ply", capsys.readouterr().out
     assert f"written to {file}" in told

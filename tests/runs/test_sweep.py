@@ -19,7 +19,7 @@ from hydra.core.utils import JobReturn, JobStatus
 from omegaconf import OmegaConf
 
 from ctm_plugin.cli import main
-from ctm_plugin.compose.compose import conf_dir
+from ctm_plugin.compose.command_line import conf_dir
 from ctm_plugin.cpu import allocator
 from ctm_plugin.errors import CTMError
 from ctm_plugin.runs import train as training

@@ -19,7 +19,7 @@ from ctm_plugin.backbones.base import Backbone
 from ctm_plugin.backbones.dvgo import DVGO
 from ctm_plugin.backbones.voxels import VoxelField
 from ctm_plugin.color.light import Light
-from ctm_plugin.compose.compose import conf_dir
+from ctm_plugin.compose.command_line import conf_dir
 from ctm_plugin.cpu import adam
 from ctm_plugin.data.blender import BlenderConfig
 from ctm_plugin.errors import CheckpointError, ConfigError

@@ -5,7 +5,7 @@ from importlib.metadata import EntryPoint
 
 from ctm_plugin.cli import main
 from ctm_plugin.compose.choices import GROUPS
-from ctm_plugin.compose.compose import conf_dir
+from ctm_plugin.compose.command_line import conf_dir
 from ctm_plugin.settings import registry
 from ctm_plugin.settings.listing import choices, plain
 from ctm_plugin.settings.registry import REGISTRIES

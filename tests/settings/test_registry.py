@@ -12,7 +12,7 @@ import pytest
 from ctm_plugin.appearance.exposure import Exposure
 from ctm_plugin.backbones.base import Backbone
 from ctm_plugin.color.transform import ColorTransform
-from ctm_plugin.compose.compose import compose, conf_dir
+from ctm_plugin.compose.command_line import compose, conf_dir
 from ctm_plugin.errors import ConfigError, CTMError, UnknownNameError
 from ctm_plugin.loggers.base import RunLogger
 from ctm_plugin.runs.assemble import color_transform, load_scene

@@ -20,7 +20,7 @@ from ctm_plugin.color.auto import Auto
 from ctm_plugin.color.ctm import CTM
 from ctm_plugin.color.settings import CTMConfig
 from ctm_plugin.color.spaces.rgb import Space as RGB
-from ctm_plugin.compose.compose import compose
+from ctm_plugin.compose.command_line import compose
 from ctm_plugin.errors import ConfigError
 from ctm_plugin.runs.assemble import load_scene
 
