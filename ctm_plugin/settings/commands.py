@@ -13,12 +13,10 @@ from typing import NamedTuple, get_type_hints
 
 from omegaconf import OmegaConf
 from rich.console import Console
-from rich.table import Table
-from rich.text import Text
 
 from ctm_plugin.errors import CTMError, Interrupted, UnknownNameError, printable
 from ctm_plugin.settings.build import asked, build, near_to, pairs, unknown_key
-from ctm_plugin.settings.listing import leaves, plain
+from ctm_plugin.settings.listing import leaves, plain, print_rows
 from ctm_plugin.settings.registry import Registry, load, said_by
 from ctm_plugin.settings.setting import defaults, keys, meanings
 
@@ -190,7 +188,7 @@ def _run(name: str, verb: Verb, arguments: Sequence[str], check: Callable[[Seque
     if {"-h", "--help"} & set(arguments):
         about, rows = explained(verb)
         print(f"{usage}\n\n{about}\n")
-        _print_rows(rows)
+        print_rows(Console(), rows)
         if verb.others == TRAINING:
             print("All choices and keys of a run can be given too: see ctm --help.")
         return
@@ -265,7 +263,7 @@ def check_form(arguments: Sequence[str]) -> None:
 def print_verbs() -> None:
     """Print the usage of the command line, and a line on each verb."""
     print(USAGE)
-    _print_rows([(name, _summary(name)) for name in names()])
+    print_rows(Console(), [(name, _summary(name)) for name in names()])
 
 
 def _summary(name: str) -> str:
@@ -294,10 +292,3 @@ def _runs(words: Sequence[str], verb: Verb) -> Iterator[Path]:
         if chosen != [path]:
             print(f"{path}: {', '.join(map(str, chosen))}", file=sys.stderr)
         yield from chosen
-
-
-def _print_rows(rows: Sequence[Sequence[str]]) -> None:
-    table = Table(box=None, pad_edge=False, show_header=False)
-    for row in rows:
-        table.add_row(*map(Text, row))
-    Console().print(table)

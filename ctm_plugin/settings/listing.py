@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -44,23 +44,25 @@ def choices(conf: Path, group: str) -> dict[str, str]:
 
 def print_choices(console: Console, conf: Path, groups: tuple[str, ...]) -> None:
     """Print one table of all groups, and of the scores that other packages bring."""
-    table = Table(box=None, pad_edge=False)
-    for heading in ("group", "choice", ""):
-        table.add_column(heading, no_wrap=heading != "", overflow="fold")
-    for group in groups:
-        for index, (name, line) in enumerate(choices(conf, group).items()):
-            table.add_row(group if index == 0 else "", name, Text(line))  # not markup: brackets are extras
-    for name in METRICS_OF_OTHERS.names():
-        table.add_row("metrics", name, METRICS_OF_OTHERS.about(name))
+    lines = [(group, choices(conf, group)) for group in groups]
+    lines.append(("metrics", {name: METRICS_OF_OTHERS.about(name) for name in METRICS_OF_OTHERS.names()}))
+    rows = [(group if n == 0 else "", *line) for group, of_group in lines for n, line in enumerate(of_group.items())]
+    print_rows(console, rows, ("group", "choice", ""))
+
+
+def print_rows(console: Console, rows: Iterable[Sequence[str]], headings: Sequence[str] = ()) -> None:
+    """Print rows of text as a table; only its last column may be broken into lines where it has headings."""
+    table = Table(box=None, pad_edge=False, show_header=bool(headings))
+    for heading in headings:
+        table.add_column(heading, no_wrap=heading not in ("", "value"), overflow="fold")
+    for row in rows:
+        table.add_row(*map(Text, row))  # not markup: brackets are extras
     console.print(table)
 
 
 def print_names(console: Console, conf: Path, groups: tuple[str, ...]) -> None:
     """Print the choices of some groups, by name, in a line each."""
-    table = Table(box=None, pad_edge=False, show_header=False)
-    for group in groups:
-        table.add_row(f"{group}=", ", ".join(names(conf, group)))
-    console.print(table)
+    print_rows(console, [(f"{group}=", ", ".join(names(conf, group))) for group in groups])
     console.print("ctm list: what each is, the other groups, and keys", highlight=False)
 
 
@@ -81,9 +83,5 @@ def keys(node: Mapping[str, Any]) -> list[tuple[str, str]]:
 
 def print_keys(console: Console, group: str, node: Mapping[str, Any], meanings: Mapping[str, str]) -> None:
     """Print a table of a group's keys."""
-    table = Table(box=None, pad_edge=False)
-    for heading in ("key", "value", ""):
-        table.add_column(heading, no_wrap=heading == "key", overflow="fold")
-    for name, value in keys(node):
-        table.add_row(f"{group}.{name}", Text(value), Text(meanings.get(name, "")))
-    console.print(table)
+    rows = [(f"{group}.{name}", value, meanings.get(name, "")) for name, value in keys(node)]
+    print_rows(console, rows, ("key", "value", ""))
