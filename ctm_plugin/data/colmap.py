@@ -12,7 +12,14 @@ from ctm_plugin.data.capture import Capture, Photograph
 from ctm_plugin.data.load import Layout
 from ctm_plugin.data.photographs import every, existing, find_listed, find_pictures, masks_beside
 from ctm_plugin.data.points import PointsOrReason, read_cloud
-from ctm_plugin.data.readers.colmap_model import is_as_shown, model_file, read_cameras, read_images, usable
+from ctm_plugin.data.readers.colmap_model import (
+    is_as_shown,
+    model_file,
+    read_cameras,
+    read_images,
+    searched_in,
+    usable,
+)
 from ctm_plugin.data.readers.folders import inside, is_picture
 from ctm_plugin.data.readers.images import read_picture
 from ctm_plugin.data.readers.layouts import MODEL_FOLDERS, model_folders, open_layout
@@ -47,7 +54,7 @@ class ColmapConfig(Layout, ColmapSettings):
             names = [name.removeprefix("images/") for name in names]
         paths = [find_listed(root, f"{folder.relative_to(root)}/{name}", source) for name in names]
         there = existing(root, paths, names, source)
-        tell_of_others(folder, len(listed))
+        tell_of_others(folder, len(listed), len(searched_in(model)))
         taken, paths = [taken[i] for i in there], [paths[i] for i in there]
         masks, shown = masks_beside(root, [path.relative_to(folder) for path in paths]), is_as_shown(model)
         photographs = [
@@ -80,10 +87,13 @@ def find_model(root: Path) -> Path:
     return folders[0] if folders else root / MODEL_FOLDERS[0]
 
 
-def tell_of_others(folder: Path, known: int) -> None:
-    """Warn of pictures in ``folder``, or in ``input`` next to it (3DGS), that a model of ``known`` ones leaves out."""
+def tell_of_others(folder: Path, known: int, searched: int) -> None:
+    """Warn of pictures in ``folder``, or in ``input`` next to it (3DGS), that a model of ``known`` ones leaves out.
+
+    Where ``ctm cameras`` made the model, of those ``searched``: it says itself what it left out before.
+    """
     for each in (folder, folder.with_name("input")):
-        count = sum(map(is_picture, each.rglob("*"))) if each.is_dir() else 0
+        count = searched or (sum(map(is_picture, each.rglob("*"))) if each.is_dir() else 0)
         if count > known:
             warning = f"the model has the cameras of {known} of {count} pictures; the others are not trained on"
             warnings.warn(f"{each}: {warning}", stacklevel=3)

@@ -14,7 +14,7 @@ from layouts import COUNT, NAMES, OPENCV, POINTS, as_text, colmap_layout, world_
 from scipy.spatial.transform import Rotation
 
 from ctm_plugin.data.colmap import ColmapConfig
-from ctm_plugin.data.readers.colmap_model import read_cameras, read_images, read_points
+from ctm_plugin.data.readers.colmap_model import mark_as_shown, read_cameras, read_images, read_points
 from ctm_plugin.errors import DataError
 from ctm_plugin.rays.cameras import camera_rays, distort
 
@@ -238,6 +238,10 @@ def test_a_model_of_few_of_the_pictures(yard):
     with pytest.warns(UserWarning, match="input: the model has the cameras of 3 of 6 pictures") as seen:
         load(yard)
     assert len(seen) == 1
+    mark_as_shown(yard / "sparse/0", names)  # of the pictures that it leaves out, ctm cameras speaks itself
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        load(yard)
 
 
 def test_points_without_tracks(yard):
