@@ -107,10 +107,12 @@ def log_exposures(start: str, views: Views) -> Float[Tensor, " n"]:
             expected = f"pictures whose EXIF has an exposure time: {len(silent)} of {len(views)} have none"
             raise ConfigError("appearance.start", start, f"{expected}, as {silent[0]}")
         return exposures.log()
-    means = []
+    gains, means = views.gains, []
+    if gains is not None and gains.isfinite().all():
+        return gains
     for index, image in enumerate(views.images):
         pixels = image if views.mask is None else image[views.mask[index]]
         pixels = pixels[pixels[..., 3] > 0] if views.has_alpha else pixels
         means.append(srgb_to_linear(unit(pixels[..., :3])).mean() if len(pixels) else torch.tensor(MIN_MEAN_LIGHT))
-    light, gains = torch.stack(means).float().cpu().clamp(min=MIN_MEAN_LIGHT).log(), views.gains
+    light = torch.stack(means).float().cpu().clamp(min=MIN_MEAN_LIGHT).log()
     return light if gains is None else gains.where(gains.isfinite(), light + (gains - light).nanmedian())

@@ -72,6 +72,7 @@ def test_exposures_start_from_points_where_there_are_some(windowed):
     started = Exposure(Exposure.Config(), replace(scene.train, gains=found)).log_gain.detach()
     means = Exposure(Exposure.Config(), scene.train).log_gain.detach()
     assert torch.equal(started[:3], found[:3])
+    assert torch.equal(Exposure(Exposure.Config(), replace(scene.train, gains=gains.log())).log_gain, gains.log())
     assert started[3] - means[3] == pytest.approx(float((found - means)[:3].median()))
 
 
