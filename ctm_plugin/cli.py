@@ -27,7 +27,7 @@ from omegaconf.errors import OmegaConfBaseException
 from rich.console import Console
 
 from ctm_plugin import __version__
-from ctm_plugin.compose.choices import register, told, with_fitting_dataset
+from ctm_plugin.compose.choices import key_meanings, register, with_fitting_dataset
 from ctm_plugin.compose.command_line import (
     GROUPS,
     at_work,
@@ -35,9 +35,9 @@ from ctm_plugin.compose.command_line import (
     check_values,
     composed,
     conf_dir,
-    elsewhere,
     explain,
     prepared,
+    searches_other_folders,
     warn_of_idle,
     without_hydras,
 )
@@ -176,7 +176,7 @@ def print_list(*groups: Path, others: Sequence[str] = ()) -> None:
         registry = REGISTRIES.get(group)
         if registry and name in registry.names() and any(each.lstrip("+").startswith(f"{group}=") for each in chosen):
             print(f"{plain(registry.docstring(name))}\n")
-        print_keys(Console(), group, config[group], told(group, name))
+        print_keys(Console(), group, config[group], key_meanings(group, name))
 
 
 def _complete(request: Sequence[str]) -> None:
@@ -225,7 +225,7 @@ def _train(arguments: Sequence[str]) -> None:
         elif flags.info:
             own.show_info(flags.info, name, overrides)
         elif is_sweep(ready) and not flags.cfg:
-            if not elsewhere(ready):
+            if not searches_other_folders(ready):
                 check_values(composed(ready), ready)
             own.multirun(name, run, [*overrides, "hydra.mode=MULTIRUN"])
         else:

@@ -8,7 +8,6 @@ import math
 import os
 import shutil
 import signal
-import sys
 import tarfile
 from collections.abc import Callable, Generator, Iterator
 from pathlib import Path
@@ -88,17 +87,6 @@ def offline(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
         patch.setenv("TORCH_HOME", str(tmp_path_factory.mktemp("torch_home")))
         patch.setenv("https_proxy", "http://127.0.0.1:9")
         patch.setenv("no_proxy", "127.0.0.1")
-        yield
-
-
-@pytest.fixture(scope="session", autouse=True)
-def composing() -> Iterator[None]:
-    """See ``composing.py``. Of the session, for fixtures of any scope; where no test composes, without Hydra."""
-    with pytest.MonkeyPatch.context() as patch:
-        if "hydra" in sys.modules:
-            from composing import quicken
-
-            quicken(patch)
         yield
 
 

@@ -1,18 +1,16 @@
 """Every choice composes into settings that its dataclasses take, with the paper's values, each default written once."""
 
-import json
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import pytest
-from forked import Command, execute
 from omegaconf import OmegaConf
 
 from ctm_plugin import cli
 from ctm_plugin.color.settings import LossWeights
 from ctm_plugin.compose import choices as choices_of
-from ctm_plugin.compose.checks import checked, kind_of, own
+from ctm_plugin.compose.checks import checked, choice_settings, kind_of
 from ctm_plugin.compose.command_line import GROUPS, conf_dir
 from ctm_plugin.compose.command_line import compose as program_compose
 from ctm_plugin.runs.assemble import color_transform
@@ -64,20 +62,6 @@ def test_budgets_are_of_backbones_and_trainers_that_exist():
     assert {path.stem for path in (conf_dir() / "budget").glob("*.yaml")} <= names
 
 
-LINES = [[], ["experiment=table3", "seed=4"], ["backbone=nerf", "trainer=paper", "dataset=llff", "dataset.root=x"]]
-
-
-@pytest.mark.slow
-def test_what_tests_compose_is_what_hydra_does(composed, tmp_path):
-    """``composing.py`` leaves other processes alone."""
-    script = "import json; from ctm_plugin.compose.command_line import compose; "
-    script += f"print(json.dumps([compose(*a) for a in {LINES}]))"
-    process = Command(script, main=execute, told=tmp_path / "told")
-    output, error = process.communicate()
-    assert process.returncode == 0, error
-    assert json.loads(output) == [composed(*arguments) for arguments in LINES]
-
-
 def test_without_arguments_the_main_job_on_the_dark_still_life(composed):
     config = composed()
     assert (config["backbone"]["name"], config["ctm"]["preset"]) == ("dvgo", "auto")
@@ -94,7 +78,7 @@ def test_a_choice_has_every_key_with_the_dataclass_default(composed, group, name
     node = composed(f"{group}={name}", "trainer=paper", "ctm=on")[group]
     kind = kind_of(group, name)
     given = {key: value for key, value in node.items() if key in ("root", "geometry")}
-    assert own(node) == plain(kind(**given))
+    assert choice_settings(node) == plain(kind(**given))
 
 
 @pytest.mark.parametrize(

@@ -97,12 +97,12 @@ def test_the_page_of_verbs(reference):
 def test_a_docstring_as_markdown(reference):
     found = reference.more("""A line.
 
-    More of ``it_self``, by :func:`~ctm_plugin.data.load.settle` and so_on.
+    More of ``it_self``, by :func:`~ctm_plugin.data.load.to_ndc_frame` and so_on.
 
     Raises:
         Never.
     """)
-    assert found == "More of `it_self`, by `settle` and so\\_on."
+    assert found == "More of `it_self`, by `to_ndc_frame` and so\\_on."
     assert reference.more("A line.") == reference.more(None) == ""
     page = reference.group_section("dataset")
     assert "PNG, JPEG, WebP" in page

@@ -13,7 +13,7 @@ from ctm_plugin.backbones.spaces import Box
 from ctm_plugin.draws import Draws
 from ctm_plugin.rays.cameras import Rays
 from ctm_plugin.rays.grid import VoxelGrid, cubic_shape
-from ctm_plugin.rays.hash_density import MAX_LOG_DENSITY, lit, log_density
+from ctm_plugin.rays.hash_density import MAX_LOG_DENSITY, log_density, visible_samples
 from ctm_plugin.rays.hash_grid import HashGrid
 from ctm_plugin.rays.occupancy import dilate, may_meet
 
@@ -74,7 +74,7 @@ class HashField(OccupiedField):
         lengths = self.space.lengths(t, points)
         lengths = lengths if isinstance(lengths, Tensor) else t.new_full((1,), lengths)
         unit = self.space.unit(points)
-        index, features = lit(*self._looked_up(), unit, lengths, ray_index, n_rays, self.alpha_thre)
+        index, features = visible_samples(*self._looked_up(), unit, lengths, ray_index, n_rays, self.alpha_thre)
         return *taken(index, t, ray_index, points), features
 
     def _looked_up(self) -> tuple[Tensor, Tensor, Tensor, nn.Linear, nn.Linear]:
@@ -106,7 +106,7 @@ class HashField(OccupiedField):
         self.occupy(self.alpha > self.alpha.mean().clamp_max(self.free_below))
 
     @torch.no_grad()
-    def settle(self, below: float, rays: Rays, hull: Callable[[Tensor], Tensor]) -> None:
+    def free_permanently(self, below: float, rays: Rays, hull: Callable[[Tensor], Tensor]) -> None:
         """Free cells permanently if they and their neighbours have less alpha than ``below``.
 
         Cells on world ``rays`` that meet no cell of more alpha stay, where ``hull`` of points ``[M, 3]`` is true.

@@ -36,7 +36,10 @@ class DirectedMLP(nn.Module):
         raise NotImplementedError
 
     def forward(self, features: Tensor, directions: Tensor, ray_index: Tensor) -> Tensor:
-        """Evaluate latents ``[M, channels]`` in [0, 1] of features ``[M, features]`` along directions ``[R, 3]``."""
+        """Evaluate latents ``[M, channels]`` in [0, 1] of features ``[M, features]`` along directions ``[R, 3]``.
+
+        ``ray_index`` ``[M]`` has each sample's row of ``directions``, which have unit length.
+        """
         embedded = self.embed(directions)
         if features.device.type != "cpu":
             return self.whole(features, embedded, ray_index)

@@ -98,7 +98,7 @@ class NGP(OccupiedBackbone):
         if self.settles and times >= SETTLING_UPDATES and times.bit_count() == 1:
             shown = self.shown_pixels()
             some = shown[draws.integers(len(shown), FOREGROUND_PIXELS)] if len(shown) else shown
-            self.field.settle(config.free_for_good, self.training_rays(some), self.hull)
+            self.field.free_permanently(config.free_for_good, self.training_rays(some), self.hull)
             self.renew_pool()
 
     def shown_pixels(self) -> Tensor:

@@ -22,10 +22,10 @@ from ctm_plugin.optim.named_optimizers import NamedOptimizers
 from ctm_plugin.optim.pace import Pace
 from ctm_plugin.optim.schedules import exponential
 from ctm_plugin.scene.views import Scene, Views
+from ctm_plugin.splats.coarse_to_fine import Stage, averaged, stages
 from ctm_plugin.splats.gaussians import Camera, Gaussians, camera_of
 from ctm_plugin.splats.growth import Change, along_curve, densify
 from ctm_plugin.splats.render import INVERSE_CHANNELS, PLANE_CHANNELS, bends, expected_depth, picture
-from ctm_plugin.splats.scales import Stage, averaged, stages
 from ctm_plugin.splats.seen import as_wide_as_pixels
 from ctm_plugin.splats.start import SH_C0, first_gaussians, first_places
 

@@ -177,7 +177,7 @@ class Workshop:
     def reconstruct(
         self, names: Sequence[str], start: tuple[int, int, float], done: Callable[[int], None]
     ) -> Reconstruction | None:
-        """Reconstruct incrementally: give the model with most :func:`sights`; ``None`` where not even two pictures fit.
+        """Reconstruct incrementally: give the model with most observations; ``None`` where not even two pictures fit.
 
         ``start`` has the numbers of :data:`STANDARD`; ``done`` is called with the number of pictures that have a pose.
         """
@@ -205,13 +205,13 @@ class Workshop:
             )  # fmt: skip
         if not mapped:
             return None
-        model = max(mapped.values(), key=lambda each: (sights(each), each.num_reg_images()))
+        model = max(mapped.values(), key=lambda each: (count_observations(each), each.num_reg_images()))
         for number in model.images:
             model.image(number).name = names[number - 1]
         return model
 
 
-def sights(model: Reconstruction) -> int:
+def count_observations(model: Reconstruction) -> int:
     """Number of a model's observations of points that at least :data:`MIN_TRACK` pictures see."""
     lengths = (point.track.length() for point in model.points3D.values())
     return sum(length for length in lengths if length >= MIN_TRACK)

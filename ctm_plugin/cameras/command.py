@@ -43,11 +43,11 @@ def cameras(folder: Path, settings: CamerasConfig) -> None:
     """
     root = take_frames(folder, settings.pictures)
     develop_raws(root)
-    tell(root, *place(root, settings))
+    tell(root, *find_and_write(root, settings))
     print_next("photos", root)
 
 
-def place(folder: Path, settings: CamerasConfig) -> tuple[list[str], Trusted, float]:
+def find_and_write(folder: Path, settings: CamerasConfig) -> tuple[list[str], Trusted, float]:
     """Find a capture's cameras and write COLMAP's model, see :func:`cameras`.
 
     Returns:
@@ -102,7 +102,10 @@ def key_of(paths: Sequence[Path], settings: CamerasConfig) -> str:
 
 
 def tell(root: Path, names: Sequence[str], trusted: Trusted, gain: float) -> None:
-    """Print how many cameras were found, where the model is, and the next command."""
+    """Print a table of the search: pictures placed, points, reprojection error in pixels, focal lengths, gain.
+
+    Then the pictures without a camera, and the model's folder.
+    """
     model = trusted.model
     placed = {model.image(number).name for number in model.reg_image_ids()}
     console = output_console()

@@ -27,7 +27,7 @@ MAX_DOUBT = 0.5
 """Largest standard deviation in pixels, by the noise, of a patch's position that is used."""
 
 
-class Sights(NamedTuple):
+class PatchObservations(NamedTuple):
     """Observations of points in one picture, and the patches round them.
 
     Attributes:
@@ -43,7 +43,7 @@ class Sights(NamedTuple):
     axes: Float32[Tensor, "o 2 2"]
 
 
-class Light(NamedTuple):
+class Luminance(NamedTuple):
     """A picture's downscaled luminance, in which keypoints and patches are searched.
 
     Attributes:
@@ -55,7 +55,9 @@ class Light(NamedTuple):
     scale: int
 
 
-def refine(model: Reconstruction, lights: Sequence[Light], reach: int, rounds: int, threads: int, done: Update) -> None:
+def refine(
+    model: Reconstruction, lights: Sequence[Luminance], reach: int, rounds: int, threads: int, done: Update
+) -> None:
     """Refine observations until the pictures' patches agree, then adjust cameras and points, for several rounds.
 
     For picture i and a point, ``sum w (P_i(x + d) - mean_{j != i} P_j(x))^2`` over a patch is made small by steps of
@@ -91,7 +93,7 @@ def refine(model: Reconstruction, lights: Sequence[Light], reach: int, rounds: i
     model.update_point_3d_errors()
 
 
-def sights_of(model: Reconstruction, numbers: Sequence[int], scales: Mapping[int, int]) -> dict[int, Sights]:
+def sights_of(model: Reconstruction, numbers: Sequence[int], scales: Mapping[int, int]) -> dict[int, PatchObservations]:
     """Project the points of these ``numbers`` into each picture, in pixels of pictures downscaled by ``scales``."""
     poses = {view: model.image(view).cam_from_world().matrix() for view in model.reg_image_ids()}
     focal = {view: model.image(view).camera.mean_focal_length() / scales[view] for view in poses}
@@ -111,14 +113,14 @@ def sights_of(model: Reconstruction, numbers: Sequence[int], scales: Mapping[int
         here = corners[rows].reshape(-1, 3) @ poses[view][:, :3].T + poses[view][:, 3]
         places = model.image(view).camera.img_from_cam(here, False).reshape(-1, 3, 2) / scales[view]
         places = torch.from_numpy(places).float()
-        found[view] = Sights(torch.tensor(rows), indices, places[:, 0], places[:, 1:] - places[:, :1])
+        found[view] = PatchObservations(torch.tensor(rows), indices, places[:, 0], places[:, 1:] - places[:, :1])
     return found
 
 
 @torch.no_grad()
 def moved(
-    seen: Mapping[int, Sights], lights: Mapping[int, Float32[Tensor, "h w"]], reach: int
-) -> dict[int, tuple[Sights, np.ndarray, list[bool]]]:
+    seen: Mapping[int, PatchObservations], lights: Mapping[int, Float32[Tensor, "h w"]], reach: int
+) -> dict[int, tuple[PatchObservations, np.ndarray, list[bool]]]:
     """Align each picture's patches: refined positions ``[O, 2]`` in pixels, and whether each can be trusted."""
     side = torch.arange(-reach, reach + 1.0)
     patch = torch.cartesian_prod(side, side).flip(-1)

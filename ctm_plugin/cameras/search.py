@@ -16,12 +16,12 @@ import torch.nn.functional as F
 from jaxtyping import Float32, Int64
 from torch import Tensor
 
-from ctm_plugin.cameras.colmap import CLOSER, FEWER_MATCHES, STANDARD, Features, Workshop, extract, sights
+from ctm_plugin.cameras.colmap import CLOSER, FEWER_MATCHES, STANDARD, Features, Workshop, count_observations, extract
 from ctm_plugin.cameras.learned import PACKAGE, find_details, has_network, nearest_to_each_other
 from ctm_plugin.cameras.lenses import tell_lenses_apart, with_focal_length
 from ctm_plugin.cameras.pairs import VOTERS, all_pairs, likely_pairs
 from ctm_plugin.cameras.photographs import BLACK, all_black
-from ctm_plugin.cameras.refine import Light, blurred, refine
+from ctm_plugin.cameras.refine import Luminance, blurred, refine
 from ctm_plugin.cameras.settings import MIN_PICTURES, CamerasConfig
 from ctm_plugin.cameras.sharpness import unsharp
 from ctm_plugin.cameras.trust import Trusted, trusted
@@ -140,16 +140,16 @@ def find_cameras(
                 if sound := best.placed >= ENOUGH_PLACED * len(paths) and not best.taken_out:
                     break
                 if start is not CLOSER:
-                    say(f"{told(best, len(paths))}: placed again from another start, with fewer matches")
+                    say(f"{search_summary(best, len(paths))}: placed again from another start, with fewer matches")
             sound = bool(matched) and sound
             if sound and best.mean >= rung.enough:
                 break
             rungs = rungs if sound else rungs[-1:]
             if rungs:
-                say(f"{told(best, len(paths))}: searched again for {rungs[0].why}")
+                say(f"{search_summary(best, len(paths))}: searched again for {rungs[0].why}")
     shrunk = settings.size < LARGER_SIZE and any(each.scale > 1 for each in lights)
     if shrunk and (best.placed < ENOUGH_PLACED * len(paths) or best.mean < MIN_OBSERVATIONS):
-        say(f"{told(best, len(paths))}: searched again in larger pictures")
+        say(f"{search_summary(best, len(paths))}: searched again in larger pictures")
         (folder / "larger").mkdir(exist_ok=True)
         with suppress(DataError):
             there = find_cameras(pictures, names, replace(settings, size=LARGER_SIZE), folder / "larger")
@@ -157,9 +157,8 @@ def find_cameras(
                 return there
     if best.placed < MIN_PICTURES or best.mean < MIN_OBSERVATIONS:
         mean = work.details() / len(paths)
-        found = (
-            f"{told(best, len(paths))} ({mean:.0f} details in a mean picture; {matched} of {len(pairs)} pairs match)"
-        )
+        found = f"{search_summary(best, len(paths))} ({mean:.0f} details in a mean picture; "
+        found += f"{matched} of {len(pairs)} pairs match)"
         hint = WANT_LESS_NOISE if matched > len(pairs) / 2 else WANT_SHARPER
         hint = WANT_APART if matched == len(pairs) and not best.placed else hint
         more = "" if settings.brighten else "brighten=true; "
@@ -169,17 +168,17 @@ def find_cameras(
         )
     with stage("refined", taken.refined[1]) as done:
         refine(best.model, lights, *taken.refined, settings.threads, done)
-    return best._replace(sights=sights(best.model)), gain
+    return best._replace(count_observations=count_observations(best.model)), gain
 
 
-def told(trusted: Trusted, count: int) -> str:
+def search_summary(trusted: Trusted, count: int) -> str:
     """Word how many of ``count`` pictures have a pose, and by how many observations."""
     text = f"a place for {trusted.placed} of {count} pictures"
     text += f", of which a mean one sees {trusted.mean:.0f} points that two others see" if trusted.placed else ""
     return f"{text}; {trusted.taken_out} more contradict their matches" if trusted.taken_out else text
 
 
-def details(light: Light, gain: float, rung: Rung) -> Features:
+def details(light: Luminance, gain: float, rung: Rung) -> Features:
     """Find the keypoints of a picture whose luminance is brightened by ``gain``, in the way of a rung."""
     if rung is LEARNED:
         places, looks = find_details(brighten(as_grey(blurred(light.light, 1.0)), gain))
@@ -193,7 +192,7 @@ def nearest_of(looks: Sequence[Tensor], first: int, second: int) -> Int64[Tensor
     return nearest_to_each_other(looks[first - 1], looks[second - 1])
 
 
-def read_light(picture: PictureFile, size: int) -> Light:
+def read_light(picture: PictureFile, size: int) -> Luminance:
     """Read a picture's luminance ``[H // scale, W // scale]``, averaged in linear light; remainders are cut.
 
     The scale is the least whole number that leaves no side above ``size``.
@@ -202,7 +201,7 @@ def read_light(picture: PictureFile, size: int) -> Light:
     pixels, weights = picture.pixels()[..., :3], torch.tensor(LUMINANCE)
     whole = pixels[: len(pixels) // scale * scale]
     strips = [light_of(each) @ weights for each in whole.split(scale * STRIP)]
-    return Light(torch.cat([F.avg_pool2d(each[None, None], scale)[0, 0] for each in strips]), scale)
+    return Luminance(torch.cat([F.avg_pool2d(each[None, None], scale)[0, 0] for each in strips]), scale)
 
 
 def light_of(pixels: Pixels) -> Float32[Tensor, "*shape c"]:

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float64
 
-from ctm_plugin.cameras.colmap import Reconstruction, require_pycolmap, sights
+from ctm_plugin.cameras.colmap import Reconstruction, count_observations, require_pycolmap
 
 MAX_ERROR = 4.0
 """Largest distance in pixels between a match and its epipolar line; COLMAP's own bound for two pictures."""
@@ -35,7 +35,7 @@ class Trusted(NamedTuple):
 
     @property
     def mean(self) -> float:
-        """Mean number of :func:`sights` a picture."""
+        """Mean number of :func:`count_observations` a picture."""
         return self.sights / max(self.placed, 1)
 
 
@@ -46,7 +46,7 @@ def trusted(model: Reconstruction | None, database: Path) -> Trusted:
     wrong = [number for number, share in shares(model, database).items() if share < MIN_INLIERS]
     for number in wrong:
         model.deregister_frame(model.image(number).frame_id)
-    return Trusted(model, model.num_reg_images(), len(wrong), sights(model))
+    return Trusted(model, model.num_reg_images(), len(wrong), count_observations(model))
 
 
 def shares(model: Reconstruction, database: Path) -> dict[int, float]:

@@ -52,17 +52,17 @@ def checked(config: Config, watched: bool = True) -> dict[str, Any]:
 
 def section_of(config: Config, section: str) -> Any:
     """Build the settings of one section that has a single dataclass."""
-    return build(kind_of(section, name_of(config[section])), own(config[section]), section)
+    return build(kind_of(section, name_of(config[section])), choice_settings(config[section]), section)
 
 
 def transform_of(config: Config) -> tuple[Any, Any]:
     """Build the settings of ``ctm``: how a transform is trained, and its own."""
     node, common = config["ctm"], load(CTM_SETTINGS)
     if name_of(node) == "none":
-        return common(), build(Nothing, own(node), "ctm")
+        return common(), build(Nothing, choice_settings(node), "ctm")
     shared = [each.name for each in fields(common)]
-    training = {key: value for key, value in own(node).items() if key in shared}
-    rest = {key: value for key, value in own(node).items() if key not in shared}
+    training = {key: value for key, value in choice_settings(node).items() if key in shared}
+    rest = {key: value for key, value in choice_settings(node).items() if key not in shared}
     return build(common, training, "ctm"), build(kind_of("ctm", name_of(node)), rest, "ctm", shared)
 
 
@@ -77,12 +77,12 @@ def name_of(node: Config) -> str:
     return str(node.get("name"))
 
 
-def own(node: Config) -> dict[str, Any]:
+def choice_settings(node: Config) -> dict[str, Any]:
     """The settings in a group's node: without ``name``, which it is registered under, and ``preset``."""
     return {key: value for key, value in node.items() if key not in ("name", "preset")}
 
 
-def made(kind: type[T], settings: Any) -> T:
+def convert(kind: type[T], settings: Any) -> T:
     """Make an instance of a dataclass out of another one's fields, which have the same names."""
     if isinstance(settings, kind):
         return settings

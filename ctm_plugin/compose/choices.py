@@ -41,7 +41,7 @@ def node(group: str, name: str = "") -> dict[str, Any]:
     return _each(group, name, defaults)
 
 
-def told(group: str, name: str = "") -> dict[str, str]:
+def key_meanings(group: str, name: str = "") -> dict[str, str]:
     """The meanings of a group's keys, by dotted name."""
     return _each(group, name, meanings)
 

@@ -64,7 +64,7 @@ def prepared(arguments: Sequence[str]) -> list[str]:
     """
     given = normalise(with_fitting_dataset(arguments))
     check_choices(given)
-    register(None if elsewhere(given) else given)
+    register(None if searches_other_folders(given) else given)
     return with_usual_backbone(given)
 
 
@@ -78,7 +78,7 @@ def check(arguments: Sequence[str]) -> list[str]:
         CTMError, HydraException: a choice, key or value cannot be used.
     """
     ready = prepared(arguments)
-    if not elsewhere(ready):  # only Hydra itself finds what lies there
+    if not searches_other_folders(ready):  # only Hydra itself finds what lies there
         with at_work():
             check_values(composed(ready), ready)
     return ready
@@ -86,7 +86,7 @@ def check(arguments: Sequence[str]) -> list[str]:
 
 def check_values(config: DictConfig, arguments: Sequence[str]) -> None:
     """Refuse keys and values that one run cannot use, and several values where there is no sweep."""
-    if not elsewhere(arguments):
+    if not searches_other_folders(arguments):
         settings = without_hydras(config, "bounded")  # the sizes that depend on it are all allowed
         if not is_sweep(arguments):
             checked(settings)
@@ -112,7 +112,7 @@ def at_work(folder: str | Path | None = None) -> AbstractContextManager[None]:
     return hydra.initialize_config_dir(os.path.abspath(folder or conf_dir()), "cli", version_base="1.3")
 
 
-def elsewhere(arguments: Sequence[str]) -> bool:
+def searches_other_folders(arguments: Sequence[str]) -> bool:
     """Tell whether a command line makes Hydra search other folders for choices too."""
     return any(argument.startswith(FOLDER_FLAGS) for argument in arguments)
 
@@ -174,7 +174,7 @@ def check_choices(arguments: Sequence[str]) -> None:
     Raises:
         ConfigError: an argument, choice or section cannot be used.
     """
-    known_here = not elsewhere(arguments)
+    known_here = not searches_other_folders(arguments)
     folders = {path.stem for path in conf_dir().iterdir()}  # such as budget, which nobody needs to name
     for argument in arguments:
         key, equals, value = argument.partition("=")
@@ -188,7 +188,7 @@ def check_choices(arguments: Sequence[str]) -> None:
         group, section = given.key_or_group, given.key_or_group.partition(".")[0]
         several = given.is_sweep_override()
         if known_here and not {"/", "@"} & set(group) and section not in ROOT_KEYS and group not in folders:
-            raise unknown_key(section, ROOT_KEYS, everywhere())
+            raise unknown_key(section, ROOT_KEYS, known_keys())
         if group not in GROUPS or given.is_delete():
             continue
         chosen = (
@@ -200,8 +200,8 @@ def check_choices(arguments: Sequence[str]) -> None:
                 raise unknown_choice(group, value if not isinstance(choice, str) else choice, known)
 
 
-def everywhere() -> list[str]:
-    """List the dotted keys of all built-in choices, for the guess which key a misplaced one was meant for."""
+def known_keys() -> list[str]:
+    """List the dotted keys of built-in choices but callbacks, for the guess which key a misplaced one was meant for."""
     names = {
         f"{section}.{key}"
         for section, registry in REGISTRIES.items()
@@ -226,5 +226,5 @@ def explain(error: Exception) -> str:
     full_key = getattr(cause, "full_key", None)
     parent = getattr(cause, "parent_node", None)
     if full_key and isinstance(parent, DictConfig) and isinstance(cause, ConfigKeyError | ConfigAttributeError):
-        return str(unknown_key(full_key, (str(key) for key in parent if key != "hydra"), everywhere()))
+        return str(unknown_key(full_key, (str(key) for key in parent if key != "hydra"), known_keys()))
     return "\n".join(printable(line) for line in str(error).strip().splitlines())

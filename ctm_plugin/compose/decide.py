@@ -9,7 +9,7 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
-from ctm_plugin.compose.checks import own
+from ctm_plugin.compose.checks import choice_settings
 from ctm_plugin.data.capture import Capture
 from ctm_plugin.data.load import Layout
 from ctm_plugin.data.rig import Rig
@@ -79,7 +79,7 @@ def _read(dataset: dict[str, Any]) -> tuple[Capture | None, Rig | None]:
     with suppress(CTMError):
         kind = DATASETS.get(str(dataset.get("name")))
         if isinstance(kind, type) and issubclass(kind, Layout):
-            layout = build(kind, own(dataset), "dataset")
+            layout = build(kind, choice_settings(dataset), "dataset")
             capture = layout.capture()
             rig = layout.rig(capture)
     return capture, rig

@@ -25,8 +25,13 @@ class Entry(Protocol):
     """Protocol of the first layer's input, made of a table ``[N, D]``, a block of rows at a time."""
 
     def enter(self, table: Tensor, at: slice, out: Tensor) -> None:
-        """Write the input ``[n, E]`` of the table's rows ``at``, of which it gets only those; ``out`` has the
-        type of the products."""
+        """Write the first layer's input of a block into ``out`` ``[n, E]``, of the products' type.
+
+        Args:
+            table: ``[n, D]``, the block's rows.
+            at: where these rows lie in the whole table.
+            out: what is written to.
+        """
 
     def leave(self, grad: Tensor, entered: Tensor) -> Tensor:
         """Turn the gradient of the input ``[n, E]``, which was ``entered``, into that of the block ``[n, D]``."""

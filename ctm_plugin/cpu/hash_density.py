@@ -44,11 +44,11 @@ def log_density(
     return density
 
 
-def lit(
+def visible_samples(
     table: Tensor, sides: Tensor, starts: Tensor, first: nn.Linear, last: nn.Linear, points: Tensor,
     lengths: Tensor, ray_index: Tensor, n_rays: int, threshold: float,
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
-    """Find samples that light reaches (:func:`ctm_plugin.rays.hash_density.lit`), on each ray as far as light goes."""
+    """As :func:`ctm_plugin.rays.hash_density.visible_samples`, on each ray only as far as light goes."""
     ends = torch.searchsorted(ray_index, torch.arange(n_rays + 1))
     marked, features = torch.zeros(len(points), dtype=torch.bool), table.new_empty(len(points), first.in_features)
     least = -math.log1p(-threshold)  # optical depth of such an alpha

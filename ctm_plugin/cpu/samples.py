@@ -112,7 +112,10 @@ def occupied_blocks(occupancy, shape):
 
 @inlined
 def _left(position, vertex, pace):
-    """Number of samples, not rounded, until a ray leaves a block along one axis; no more are skipped."""
+    """Number of samples, not rounded, until a ray leaves a block along one axis; ``MAX_SKIPPED`` where ``pace`` is 0.
+
+    ``position`` is in vertices, ``vertex`` the nearest one, ``pace`` in vertices a sample.
+    """
     begin = np.float32(vertex // BLOCK_SIDE * BLOCK_SIDE) - np.float32(0.5)
     end = begin + np.float32(BLOCK_SIDE)
     if pace == 0:

@@ -63,9 +63,10 @@ def course(frames: Iterable[Float32[np.ndarray, "h w"]]) -> Course:
 
 
 def choose(courses: Sequence[Course]) -> list[list[int]]:
-    """Choose sharp frames of clips: numbers from 0 for each clip; none of a clip that does not move.
+    """Choose frames of clips: indices from 0, by clip; none of a clip that does not move.
 
-    Each is the sharpest of a window of equal movement; all clips together have ``MIN_FRAMES`` to ``MAX_FRAMES``.
+    Each is the sharpest of a window of equal movement. All clips have ``MIN_FRAMES`` to ``MAX_FRAMES`` windows, rounded
+    for each clip; a window whose sharpest frame is far blurrier than its neighbours' gives none.
     """
     lengths = [each.moved[-1] if len(each.moved) and each.moved[-1] >= MIN_MOVEMENT else 0.0 for each in courses]
     count = np.clip(round(sum(lengths) / FRAME_MOVEMENT), MIN_FRAMES, MAX_FRAMES)

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from ctm_plugin.data.capture import Capture, Photograph
 from ctm_plugin.data.load import Layout
-from ctm_plugin.data.photographs import every, existing, find_listed, find_pictures, masks_beside
+from ctm_plugin.data.photographs import every_nth, existing, find_listed, find_pictures, masks_beside
 from ctm_plugin.data.points import PointsOrReason, read_cloud
 from ctm_plugin.data.readers.colmap_model import (
     is_as_shown,
@@ -70,7 +70,7 @@ class ColmapConfig(Layout, ColmapSettings):
             root,
             cameras_file,
             photographs,
-            every(self.test_every, len(photographs)),
+            every_nth(self.test_every, len(photographs)),
             shrunk,
             clouds=[cloud],
             lacking=(points, "no points that the pictures see"),

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float64
 
 from ctm_plugin.data.capture import Capture, Photograph
 from ctm_plugin.data.load import Layout
-from ctm_plugin.data.photographs import every, find_pictures, list_pictures, masks_beside
+from ctm_plugin.data.photographs import every_nth, find_pictures, list_pictures, masks_beside
 from ctm_plugin.data.points import model_beside
 from ctm_plugin.data.readers.folders import inside, is_picture
 from ctm_plugin.data.readers.images import PictureFile, map_numbers, read_picture
@@ -34,7 +34,7 @@ class LLFFConfig(Layout, LLFFSettings):
         Test views have depth where a folder ``depth`` holds it: ``.npy`` in units of the file's poses, or 16-bit PNG
         with ``depth_scale`` in ``settings.json``.
 
-        Forward-facing the scene is moved and scaled, see :func:`~ctm_plugin.data.load.settle`; else it keeps the
+        Forward-facing the scene is moved and scaled, see :func:`~ctm_plugin.data.load.to_ndc_frame`; else it keeps the
         file's units and near lies a little in front of the nearest bound. Far is a distance along the rays that holds
         all that the bounds hold.
         """
@@ -51,9 +51,9 @@ class LLFFConfig(Layout, LLFFSettings):
         source, paths = inside(root, LLFF_FILE), [picture.path for picture in pictures]
         c2w, hwf, bounds = read_poses(source, bounded=self.near is None or self.far is None)
         if len(paths) != len(c2w):
-            expected = f"{len(paths)}, one for each picture in {paths[0].parent}{which(root)}"
+            expected = f"{len(paths)}, one for each picture in {paths[0].parent}{pictures_hint(root)}"
             raise DataError(source, f"{len(c2w)} poses", expected)
-        testing = every(self.test_every, len(paths))
+        testing = every_nth(self.test_every, len(paths))
         # LLFF names shrunk pictures anew, in the order of COLMAP's, which images has.
         whole = sorted(path for path in (root / "images").glob("*") if is_picture(path))
         named = [path.name for path in (whole if len(whole) == len(paths) else paths)]
@@ -83,7 +83,7 @@ class LLFFConfig(Layout, LLFFSettings):
         )
 
 
-def which(root: Path) -> str:
+def pictures_hint(root: Path) -> str:
     """Word the hint how to find the pictures of the poses in ``poses_bounds.npy``, which does not name them."""
     if (root / "view_imgs.txt").is_file():
         return ": leave only those there that view_imgs.txt names"

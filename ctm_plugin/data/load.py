@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from ctm_plugin.data.capture import Capture
-from ctm_plugin.data.lit import warn_of_lit
+from ctm_plugin.data.lit_references import warn_of_lit
 from ctm_plugin.data.near_far import near_far, nearest
 from ctm_plugin.data.points import first_points
 from ctm_plugin.data.readers.records import rendered
@@ -102,10 +102,10 @@ def make_scene(
         exposure=config.exposure * rendered(root, "light"),
         points=points,
     )
-    return settle(scene, root)
+    return to_ndc_frame(scene, root)
 
 
-def settle(scene: Scene, root: Path) -> Scene:
+def to_ndc_frame(scene: Scene, root: Path) -> Scene:
     """Move and scale a ``forward`` scene as NDC needs it, NeRF's way; others stay as they are.
 
     The world is moved so that the mean camera stands at the origin and looks along -z, and scaled so that ``near`` lies

@@ -50,7 +50,7 @@ def near_far(capture: Capture, config: BoundsConfig, views: Sequence[Views]) -> 
 
     Raises a DataError unless near < far.
     """
-    near, far = (given(capture, config, key) for key in ("near", "far"))
+    near, far = (configured_bound(capture, config, key) for key in ("near", "far"))
     if near is None or far is None:
         bounds = found_bounds(capture, config.geometry, views)
         near, far = bounds[0] if near is None else near, bounds[1] if far is None else far
@@ -60,7 +60,7 @@ def near_far(capture: Capture, config: BoundsConfig, views: Sequence[Views]) -> 
     return near, far
 
 
-def given(capture: Capture, config: BoundsConfig, key: str) -> float | None:
+def configured_bound(capture: Capture, config: BoundsConfig, key: str) -> float | None:
     """Near or far of the configuration, else of the first file that has it."""
     if (own := getattr(config, key)) is not None:
         return float(own)
@@ -70,7 +70,7 @@ def given(capture: Capture, config: BoundsConfig, key: str) -> float | None:
 
 def nearest(capture: Capture, config: BoundsConfig) -> float | None:
     """Find the nearest depth by the data set's files or their points, without pixels; ``None``: they give none."""
-    if (near := given(capture, config, "near")) is not None:
+    if (near := configured_bound(capture, config, "near")) is not None:
         return near
     if capture.rows is not None:
         return float(np.nanmin(capture.rows))  # NaN: rows of pictures that see no points
@@ -108,7 +108,7 @@ def found_bounds(capture: Capture, geometry: Geometry, views: Sequence[Views]) -
 def ray_bounds(nearest: float, farthest: float, geometry: Geometry, views: Views) -> tuple[float, float]:
     """Turn bounds of depth along the cameras' axes into bounds of distance along the rays, for the views' widest ray.
 
-    ``forward`` keeps the nearest as it is: :func:`~ctm_plugin.data.load.settle` has its own margin.
+    ``forward`` keeps the nearest as it is: :func:`~ctm_plugin.data.load.to_ndc_frame` has its own margin.
     """
     return nearest * (1.0 if geometry == "forward" else NEAR_MARGIN), farthest * widest(views)
 

@@ -141,6 +141,6 @@ def existing(root: Path, paths: Sequence[Path | None], names: Sequence[str], sou
     return [number for number, path in enumerate(paths) if path is not None]
 
 
-def every(step: int, count: int) -> np.ndarray:
+def every_nth(step: int, count: int) -> np.ndarray:
     """Booleans ``[count]``, true at each index divisible by ``step``."""
     return np.arange(count) % step == 0

@@ -27,7 +27,7 @@ def develop_photographs(capture: Capture, config: BoundsConfig) -> tuple[Views, 
     """Develop a capture's photographs into training views, thinned by ``config.skip``, and test views.
 
     Raises a DataError without either, a ConfigError for ``random_matched`` without alpha."""
-    source, photographs = capture.source, upright(capture.photographs, capture.source)
+    source, photographs = capture.source, as_stored(capture.photographs, capture.source)
     headers = headers_of(photographs)
     photo = replace(config, downscale=1) if capture.shrunk else config
     cameras = [camera_of(photograph, header, source) for photograph, header in zip(photographs, headers, strict=True)]
@@ -71,7 +71,7 @@ def develop_photographs(capture: Capture, config: BoundsConfig) -> tuple[Views, 
     return train, test
 
 
-def upright(photographs: Sequence[Photograph], source: Path) -> list[Photograph]:
+def as_stored(photographs: Sequence[Photograph], source: Path) -> list[Photograph]:
     """Take pictures as they are stored where EXIF would turn them away from their cameras, with one warning.
 
     COLMAP and nerfstudio look at stored pixels.

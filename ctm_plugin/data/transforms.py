@@ -13,9 +13,9 @@ import numpy as np
 
 from ctm_plugin.data.capture import Capture, Photograph
 from ctm_plugin.data.develop import DYNAMIC_PREFIX
-from ctm_plugin.data.lit import as_captured, check_folder
+from ctm_plugin.data.lit_references import as_captured, check_folder
 from ctm_plugin.data.load import Layout
-from ctm_plugin.data.photographs import every, existing, find_listed, has_shrunk, masks_beside
+from ctm_plugin.data.photographs import every_nth, existing, find_listed, has_shrunk, masks_beside
 from ctm_plugin.data.points import model_beside, ply_named
 from ctm_plugin.data.readers.folders import inside, plain_name
 from ctm_plugin.data.readers.frames import SIZE_KEYS, check_keys, frames_of, read_camera, read_pose
@@ -225,7 +225,7 @@ def split(listed: list[Listed], source: Path, test_every: int) -> tuple[list[Lis
         there = existing(source.parent, [each.path for each in training], [str(each.name) for each in training], source)
         training = [training[i] for i in there]
     if all(each.testing is None for each in listed):
-        chosen = every(test_every, len(training)).tolist()
+        chosen = every_nth(test_every, len(training)).tolist()
         listed = [each._replace(testing=tested) for each, tested in zip(training, chosen, strict=True)]
         testing = [each for each in listed if each.testing]
         training = [each for each in listed if not each.testing]

@@ -37,7 +37,7 @@ class Dots(NamedTuple):
     colors: UInt8[np.ndarray, "p 3"]
 
 
-class Sights(NamedTuple):
+class PointObservations(NamedTuple):
     """Points that a picture observes: their rows ``[T]``, positions in pixels ``[T, 2]``, and its colours there."""
 
     rows: np.ndarray
@@ -60,12 +60,12 @@ class CapturedView(NamedTuple):
     testing: bool
     lens: Intrinsics
     pose: Float[np.ndarray, "3 4"]
-    sight: Sights
+    sight: PointObservations
 
 
 NO_DOTS = Dots(np.empty((0, 3)), np.empty((0, 3)), np.empty((0, 3), np.uint8))
 """A cloud without points."""
-NO_SIGHTS = Sights(np.empty(0, np.int64), np.empty((0, 2)), np.empty((0, 3), np.uint8))
+NO_SIGHTS = PointObservations(np.empty(0, np.int64), np.empty((0, 2)), np.empty((0, 3), np.uint8))
 """The observations of a picture that sees no point."""
 
 
@@ -161,13 +161,13 @@ def frame_of(shot: CapturedView, masked: bool) -> dict[str, Any]:
     return {**frame, "transform_matrix": [*shot.pose.tolist(), [0.0, 0.0, 0.0, 1.0]]}
 
 
-def seen(points: Points, views: Views, index: int, image: Pixels) -> Sights:
+def seen(points: Points, views: Views, index: int, image: Pixels) -> PointObservations:
     """Observations of a training view: the points known to be in it, and its colours there."""
     rows = points.point[points.view == index]
     column, row, _, there = projected(points.positions[rows].double(), views, index)
     rows, places = rows[there], torch.stack([column, row], 1)[there]
     x, y = (at.long().clamp(0, n - 1) for at, n in zip(places.unbind(1), (views.width, views.height), strict=True))
-    return Sights(rows.numpy(), places.numpy(), to_8_bits(unit(image[y, x, :3])).numpy())
+    return PointObservations(rows.numpy(), places.numpy(), to_8_bits(unit(image[y, x, :3])).numpy())
 
 
 def coloured(scene: Scene, shots: Sequence[CapturedView]) -> tuple[Dots, list[CapturedView]]:

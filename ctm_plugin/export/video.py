@@ -15,7 +15,7 @@ from torch import Tensor
 from ctm_plugin.backbones.posed import PosedBackbone
 from ctm_plugin.color.light import AS_IS, Light, chosen_light
 from ctm_plugin.cpu.products import fast_products
-from ctm_plugin.data.readers.key_frames import read_key_frames
+from ctm_plugin.data.readers.camera_path import read_key_frames
 from ctm_plugin.data.rig import SURROUND_DEGREES, turn
 from ctm_plugin.errors import ConfigError
 from ctm_plugin.export.settings import VideoConfig, can_mp4
@@ -33,7 +33,7 @@ FFMPEG_BT709 = ["-vf", f"scale=out_color_matrix=bt709:out_range=tv,setparams={BT
 """ffmpeg's arguments: BT.709's colours, tagged as such, and the index at the file's beginning."""
 
 FILM_WIDTH = 1280
-"""Width in pixels that films reach where a backbone renders pixels finer than the training's."""
+"""Largest width in pixels to which films are enlarged, by at most the backbone's ``max_scale``; wider views stay."""
 
 
 def render(run: Path, settings: VideoConfig) -> None:

@@ -7,7 +7,13 @@ from typing import NamedTuple
 
 
 class Turn(NamedTuple):
-    """A change of pace: from ``step`` on, at ``place`` of the schedule, its rest ends with step ``end``."""
+    """A change of pace.
+
+    Attributes:
+        step: the training's step from which it holds.
+        place: the schedule's step then.
+        end: the training's step at which the schedule ends.
+    """
 
     step: int
     place: float

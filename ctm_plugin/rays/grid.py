@@ -31,7 +31,7 @@ class VoxelGrid(nn.Module):
     """The vertices of a grid over a box ``[2, 3]`` (its lowest and highest corner), ``shape`` = (X, Y, Z), each >= 2.
 
     Attributes:
-        voxel: edge of a voxel in scene units.
+        voxel: cube root of the box's volume by vertex, in the box's units: a voxel's edge where voxels are cubes.
     """
 
     def __init__(self, box: Float[Tensor, "2 3"], shape: Shape):

@@ -33,9 +33,9 @@ def log_density(
     return _first(encoded(table, points, sides, starts), first, last)
 
 
-@looped("hash_density:lit", when=lambda table, *_: table.shape[1] == 2)
+@looped("hash_density:visible_samples", when=lambda table, *_: table.shape[1] == 2)
 @torch.no_grad()
-def lit(
+def visible_samples(
     table: Tensor, sides: Tensor, starts: Tensor, first: nn.Linear, last: nn.Linear, points: Tensor,
     lengths: Tensor, ray_index: Tensor, n_rays: int, threshold: float,
 ) -> tuple[Tensor, Tensor]:  # fmt: skip

@@ -10,11 +10,11 @@ from typing import Any
 
 import lightning as L
 
-from ctm_plugin.appearance.gains import gains_by_points
+from ctm_plugin.appearance.measured_gains import gains_by_points
 from ctm_plugin.backbones.base import Backbone
 from ctm_plugin.color.photometric import Photometric
 from ctm_plugin.color.transform import Chain, ColorTransform
-from ctm_plugin.compose.checks import checked, made, name_of, section_of, transform_of
+from ctm_plugin.compose.checks import checked, convert, name_of, section_of, transform_of
 from ctm_plugin.data.capture import Capture
 from ctm_plugin.draws import seeded
 from ctm_plugin.errors import ConfigError, CTMError
@@ -56,7 +56,7 @@ def assemble(
     given = checked(config, watched=run is not None)
     add_others()
     seed = config["seed"]
-    photometric = made(Photometric, given["loss"])
+    photometric = convert(Photometric, given["loss"])
     transform = color_transform(config, seed)
     name = name_of(config["backbone"])
     backbone = BACKBONES.get(name)
@@ -65,7 +65,7 @@ def assemble(
         raise ConfigError("appearance", shares, f"none: backbone={name} has no pictures that cameras took")
     observers = ([], [])
     if run is not None:
-        observed = [made(CALLBACKS.get(each), settings) for each, settings in given["callbacks"].items()]
+        observed = [convert(CALLBACKS.get(each), settings) for each, settings in given["callbacks"].items()]
         observers = (loggers(config, run, step), observed)
     scene = load_scene(config, capture) if scene is None else scene
     if not isinstance(scene, backbone.Scene):
@@ -110,7 +110,7 @@ def loggers(config: Config, run: Path, step: int) -> list[RunLogger]:
 
 def load_scene(config: Config, capture: Capture | None = None) -> Any:
     """Load the data set that a configuration names; its ``capture`` is given where it has been read already."""
-    dataset = made(DATASETS.get(name_of(config["dataset"])), section_of(config, "dataset"))
+    dataset = convert(DATASETS.get(name_of(config["dataset"])), section_of(config, "dataset"))
     return dataset.load() if capture is None else dataset.load(capture)
 
 

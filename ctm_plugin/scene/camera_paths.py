@@ -72,7 +72,7 @@ def spiral(views: Views, near: Number, far: Number, frames: int = 120, turns: in
     return torch.from_numpy(poses).to(torch.float32)
 
 
-def walk(centres: Float64[np.ndarray, "n 3"]) -> Int64[np.ndarray, " n"]:
+def visiting_order(centres: Float64[np.ndarray, "n 3"]) -> Int64[np.ndarray, " n"]:
     """The order in which a path visits cameras: of capture, or always to the nearest unvisited where far shorter."""
     apart = np.linalg.norm(centres[:, None] - centres, axis=-1)
     order = [int(apart.sum(1).argmax())]
@@ -88,7 +88,7 @@ def walk(centres: Float64[np.ndarray, "n 3"]) -> Int64[np.ndarray, " n"]:
 def capture(views: Views, frames: int = 120) -> Float32[Tensor, "f 3 4"]:
     """Path that passes smoothly by the places where the photographs were taken, slowly at both ends.
 
-    At a share s of the line through all cameras (:func:`walk`) stands their mean, each camera weighed by
+    At a share s of the line through all cameras (:func:`visiting_order`) stands their mean, each camera weighed by
     ``exp(-(s - s_i)^2 / (2 0.1^2))``; so the path stays among the cameras. It is walked through as :func:`eased` says.
 
     Args:
@@ -96,7 +96,7 @@ def capture(views: Views, frames: int = 120) -> Float32[Tensor, "f 3 4"]:
         frames: see :func:`spiral`.
     """
     c2w = views.c2w.cpu().double().numpy()
-    c2w = c2w[walk(c2w[:, :, 3])]
+    c2w = c2w[visiting_order(c2w[:, :, 3])]
     along = _lengths(c2w[:, :, 3])
     fine = np.linspace(0.0, 1.0, 8 * max(frames, 16))
     places = np.interp(eased(np.linspace(0.0, 1.0, frames)), _lengths(_means(c2w, along, fine)[:, :, 3]), fine)
@@ -203,7 +203,7 @@ class KeyFrames:
         return torch.from_numpy(poses).float(), torch.from_numpy(PchipInterpolator(keys, fov)(at)).float()
 
     def content(self) -> dict[str, Any]:
-        """Content of a key-frame file, as :func:`ctm_plugin.data.readers.key_frames.read_key_frames` reads it."""
+        """Content of a key-frame file, as :func:`ctm_plugin.data.readers.camera_path.read_key_frames` reads it."""
         keys = [
             {"camera_to_world": pose.tolist(), "fov": math.degrees(fov)}
             for pose, fov in zip(self.c2w, self.fov, strict=True)

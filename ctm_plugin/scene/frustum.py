@@ -19,7 +19,10 @@ from ctm_plugin.scene.views import Scene, Views
 
 
 def edge_points(extents: Tensor, points: int = 33) -> tuple[Tensor, Tensor]:
-    """x and y ``[..., points^2]`` in pixels of a grid of points over images ``[..., 2]``, their edges included."""
+    """x and y ``[..., points^2]`` of a regular grid over pictures of ``extents`` (width, height) ``[..., 2]``, in pixels.
+
+    ``points`` lie on a side, the first and the last on the picture's borders.
+    """
     part = torch.linspace(0, 1, points)
     return extents[..., :1] * part.repeat(points), extents[..., 1:] * part.repeat_interleave(points)
 

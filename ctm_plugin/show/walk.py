@@ -18,8 +18,13 @@ FILE_SCRIPT = """<head><script>
 // Pages that are opened as files may not start module workers from blobs: without one, viser takes a data address.
 const made = URL.createObjectURL;
 URL.createObjectURL = (of) => of.type?.startsWith("text/javascript") ? "" : made.call(URL, of);
+// Half precision, which phones and WebKit may take for mediump, is too little for covariances.
+const compiled = WebGL2RenderingContext.prototype, source = compiled.shaderSource;
+compiled.shaderSource = function (shader, text) {
+  source.call(this, shader, text.replaceAll("precision mediump float", "precision highp float"));
+};
 </script><style>:has(> [aria-label$="scene tree"]) { display: none !important }</style>"""
-"""Script added to viser's page, which lets a page opened as a file start workers, such as viser's sorting by depth."""
+"""Script added to viser's page: lets a page opened as a file start viser's sorting worker; renders in 32-bit floats."""
 
 
 class Spots(NamedTuple):

@@ -15,7 +15,7 @@ GROW_SCALE3D = 0.01
 """Standard deviation, in extents of the cameras, from which on a Gaussian is split; smaller ones are duplicated
 (gsplat's ``grow_scale3d``)."""
 MIN_GAUSSIANS = 100
-"""Least number of Gaussians that pruning leaves: without Gaussians a field would never learn again."""
+"""Number of the most opaque Gaussians that are kept where none is opaque enough: a field without any never learns."""
 SPLIT_FACTOR = 1.6
 """Ratio of the scale of a Gaussian to that of the two it is split into."""
 CELL_BITS = 7

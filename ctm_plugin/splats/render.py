@@ -20,7 +20,7 @@ STRIDES = (1, 4)
 EDGE_WIDTH = 0.03
 """Difference of two colours, as a share of the scene's range, at which a bend weighs 1 / e."""
 MIN_EXPONENT = -8
-"""Least exponent of a bend's weight."""
+"""Least exponent of a bend's weight, see :func:`bends`: the strongest edges of colour still weigh exp(-8)."""
 MIN_OPACITY = 0.1
 """Least opacity of a pixel that its depth is divided by."""
 

@@ -59,7 +59,7 @@ def photos(folder: Path, settings: PhotosConfig, others: Sequence[str] = ()) -> 
         for path in list_photographs(root, DEFAULT_FOLDER):
             read_picture(path)
     # These take seconds to import: what lies in the folder is refused before.
-    from ctm_plugin.cameras.command import place, tell
+    from ctm_plugin.cameras.command import find_and_write, tell
     from ctm_plugin.export.command import write_views
     from ctm_plugin.export.page import write_page
     from ctm_plugin.export.video import film
@@ -75,7 +75,7 @@ def photos(folder: Path, settings: PhotosConfig, others: Sequence[str] = ()) -> 
     with whole(parts(root, 60 * settings.minutes)):
         if why:
             say(f"cameras: {why}; COLMAP searches for them in brightened copies")
-            tell(root, *place(root, CamerasConfig(overwrite=why != NO_CAMERAS)))
+            tell(root, *find_and_write(root, CamerasConfig(overwrite=why != NO_CAMERAS)))
         if (run / PAGE).exists():
             say(f"{run} is finished: again=true trains again")
         elif (run / CONFIG).exists():
@@ -193,7 +193,7 @@ def choices(root: Path, minutes: float, others: Sequence[str], say: Callable[[st
     """Choose the layout, the pictures' width and the budget, and print them; keys that are given stay."""
     import torch
 
-    from ctm_plugin.appearance.gains import SIZE, UNEVEN, gains_by_points
+    from ctm_plugin.appearance.measured_gains import SIZE, UNEVEN, gains_by_points
     from ctm_plugin.runs.assemble import assemble, load_scene
     from ctm_plugin.workflows.plan import REFERENCE, TIMED_COLUMNS, plan, timed_steps
 

@@ -136,7 +136,7 @@ def test_free_space_round_an_object_settles(scene):
     module.renew_pool()
     assert module.pool is None
     field = module.field
-    field.settle(0.05, module.training_rays(torch.zeros(0, dtype=torch.long)), module.hull)
+    field.free_permanently(0.05, module.training_rays(torch.zeros(0, dtype=torch.long)), module.hull)
     distance, cell = field.grid.vertices().norm(dim=1), (1 / field.grid.scale).norm()
     assert field.allowed[distance < 0.8].all()
     assert not field.allowed[distance > 0.8 + 3 * cell].any()
@@ -167,7 +167,7 @@ def test_what_the_field_has_lost_of_the_object_is_not_free_for_good(scene):
     assert torch.equal(shown, (module.pixels[:, 3] > 0).nonzero().squeeze(1))
     field.alpha = (inside & there).float()
     field.occupy(field.alpha > 0)
-    field.settle(0.05, module.training_rays(shown), module.hull)
+    field.free_permanently(0.05, module.training_rays(shown), module.hull)
     assert field.allowed[inside & there].all()
     # Above what is left, where views from the side look past it; not outside of the pictures' hull.
     above = middle[:, 2] > 0.2 + 3 * half[2]

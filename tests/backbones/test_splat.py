@@ -1,4 +1,4 @@
-"""Splats: their constants meet colours as they are encoded; growth, checkpoints, processes, whole runs."""
+"""Splats: their constants meet colours as they are encoded; checkpoints, processes, whole runs."""
 
 import dataclasses
 import math
@@ -9,50 +9,28 @@ import ddp_rank
 import pytest
 import torch
 import torch.nn.functional as F
-from faults import checkpoint, differences
+from faults import checkpoint
 from forked import Command
+from splat_runs import GROWS, SPLAT, make, stepped
 from torch import Tensor
 
 import ctm_plugin
-from ctm_plugin.backbones.settings import SplatConfig
-from ctm_plugin.backbones.splat import RESET_OPACITY, Splat
+from ctm_plugin.backbones.splat import Splat
 from ctm_plugin.color.dssim import dssim
-from ctm_plugin.color.photometric import Photometric
 from ctm_plugin.data.blender import BlenderConfig
-from ctm_plugin.errors import CheckpointError, CTMError, Interrupted
+from ctm_plugin.errors import CheckpointError, CTMError
 from ctm_plugin.runs.assemble import assemble
 from ctm_plugin.runs.evaluate import evaluate
 from ctm_plugin.runs.load import load_posed
 from ctm_plugin.runs.rundir import LAST
 from ctm_plugin.runs.train import resume, train
 from ctm_plugin.scene.views import Scene, Views
-from ctm_plugin.splats import scales
-from ctm_plugin.splats.gaussians import Gaussians
-from ctm_plugin.splats.growth import Change, along_curve
 from ctm_plugin.splats.render import bends
-
-SPLAT = ("backbone=splat", "trainer.image_every=null")
-GROWS = ("backbone.threshold=1e-6", "backbone.per_pixel=0.075")
-"""By which next to all Gaussians are doubled, up to 432."""
 
 
 @pytest.fixture(scope="module")
 def scene(ball) -> Scene:
     return BlenderConfig(root=ball).load()
-
-
-def make(scene: Scene, kind: str = "l1", weight: float = 1.0, **settings: Any) -> Splat:
-    """Of 80 Gaussians at most, as it is before the first step."""
-    module = Splat(SplatConfig(**{"first": 80} | settings), scene, photometric=Photometric(kind=kind, weight=weight))
-    module.on_train_start()
-    return module
-
-
-def stepped(module: Splat) -> dict[str, Tensor]:
-    """A training step's terms; its gradients are in the tables."""
-    module.training_step(None, 0)["loss"].backward()
-    module.on_after_backward()
-    return module.terms
 
 
 @pytest.mark.slow
@@ -207,130 +185,6 @@ def test_rgb_and_a_gain_pull_alike(compose, relative):
     else:
         assert factor > 2
         assert first > 0.1
-
-
-# Growth
-
-
-def test_what_pulls_at_a_gaussian_is_counted(scene):
-    """The gradient of its place on the picture, in halves of its sides, over the views that see it."""
-    module = make(scene)
-    expected, seen = torch.zeros(len(module.grad2d)), torch.zeros(len(module.grad2d))
-    for step in range(3):
-        module.batches_seen = step
-        module.training_step(None, 0)["loss"].backward()
-        ((shift, half),) = module.shifts
-        assert half.tolist() == [6, 6]
-        length = (shift.grad * 6).norm(dim=1)
-        expected, seen = expected + length, seen + (length > 0)
-        module.on_after_backward()
-        assert not module.shifts
-    torch.testing.assert_close(module.grad2d, expected)
-    assert torch.equal(module.grad2d_count, seen)
-    assert seen.max() == 3
-
-
-def test_the_pull_does_not_hang_on_how_many_views_a_step_has(scene):
-    """Two views at once pull as they do one after the other: the threshold means the same."""
-    both, alone = make(scene, views=2, dssim=0.0), make(scene, dssim=0.0)
-    stepped(both)
-    for step in range(2):
-        alone.batches_seen = step
-        stepped(alone)
-    torch.testing.assert_close(both.grad2d, alone.grad2d, atol=1e-7, rtol=1e-4)
-    assert torch.equal(both.grad2d_count, alone.grad2d_count)
-
-
-def test_pictures_that_nothing_follows_leave_nothing_behind(scene):
-    """As benchmarks take steps: none of a Trainer's hooks is called."""
-    module = make(scene)
-    for _ in range(3):
-        module.training_step(None, 0)["loss"].backward()
-    assert len(module.shifts) == 1
-    assert not make(scene).depths
-
-
-@pytest.mark.parametrize(("times", "counted"), [(1, 40), (5, 40), (6, 48)])
-def test_few_views_have_the_cap_of_forty(scene, times, counted):
-    """Of 8 views, once and repeated."""
-    train = scene.train
-    more = Views(train.images.repeat(times, 1, 1, 1), train.c2w.repeat(times, 1, 1), train.intrinsics.repeat(times, 1),
-                 tuple(map(str, range(times * len(train)))))  # fmt: skip
-    module = make(dataclasses.replace(scene, train=more), per_pixel=0.1)
-    assert module.cap_max == int(0.1 * counted * train.height * train.width)
-
-
-@pytest.fixture(scope="module")
-def grown(compose, tmp_path_factory) -> tuple[dict[str, Any], Path]:
-    """20 steps of two batches; growth at 5, 10 and 15, all nearly transparent at 10; its whole run."""
-    config = compose(
-        *SPLAT, *GROWS, "ctm.pretrain_steps=20", "trainer.accumulate_grad_batches=2", "appearance=exposure",
-        "dataset.background=random_matched", "backbone.lr_opacities=0.2", "backbone.first=100",
-    )  # fmt: skip
-    run = tmp_path_factory.mktemp("grown") / "whole"
-    train(config, run)
-    return config, run
-
-
-def test_the_run_grows_and_has_its_optimizers(grown):
-    _, run = grown
-    saved = checkpoint(run)
-    count = len(saved["state_dict"]["tables.means"])
-    assert 200 < count <= 432
-    assert (saved["global_step"], saved["batches_seen"]) == (20, 40)
-    assert sorted(saved["optimizer_states"][0]) == ["appearance", "ctm", "means", "splats"]
-    rates = {group["name"]: group["lr"] for group in saved["optimizer_states"][0]["splats"]["param_groups"]}
-    assert rates["splats/shN"] == pytest.approx(rates["splats/sh0"] / 20)
-    moments = saved["optimizer_states"][0]["means"]["state"][0]
-    assert moments["exp_avg"].shape == (count, 3)
-    assert saved["state_dict"]["grad2d_count"].max() > 0
-
-
-@pytest.mark.parametrize("batch", [13, *(pytest.param(each, marks=pytest.mark.slow) for each in (4, 19, 33))])
-def test_an_interrupted_run_goes_on_to_the_bit(grown, tmp_path, ctrl_c, batch):
-    """Before anything grew and after, just before the reset and long after it."""
-    config, whole = grown
-    interrupted(config, tmp_path / "run", ctrl_c, batch)
-    assert differences(tmp_path / "run", whole) == []
-
-
-def interrupted(config: dict[str, Any], run: Path, ctrl_c: Any, batch: int) -> None:
-    """Train, stopped in the middle of a batch and gone on with."""
-    ctrl_c(lambda seen: seen == batch)
-    with pytest.raises(Interrupted):
-        train(config, run)
-    ctrl_c(lambda seen: False)
-    resume(run)
-
-
-def test_a_reset_makes_all_nearly_transparent(scene):
-    module = make(scene)
-    optimizers = module.configure_optimizers()
-    module.optimizers = lambda use_pl_optimizer: optimizers
-    stepped(module)
-    optimizers.step()
-    module.tables["opacities"].data[3] = -9.0
-    moments = optimizers.state[module.tables["opacities"]]
-    assert moments["exp_avg"].any()
-    with torch.no_grad():
-        module._reset()
-    assert module.gaussians.opacities.sigmoid().max().item() == pytest.approx(RESET_OPACITY)
-    assert module.gaussians.opacities[3].item() == -9.0
-    assert not moments["exp_avg"].any()
-    assert not moments["exp_avg_sq"].any()
-
-
-def test_harmonics_are_learned_one_degree_after_the_other(compose, tmp_path, monkeypatch):
-    used, own = [], Splat.render
-
-    def render(self, *args):
-        used.append(self.degrees)
-        return own(self, *args)
-
-    monkeypatch.setattr(Splat, "render", render)
-    train(compose(*SPLAT, "ctm=off", "backbone.degree=2", "backbone.degree_every=8"), tmp_path)
-    assert used[:20] == [1] * 8 + [2] * 8 + [3] * 4
-    assert set(used[20:]) == {3}
 
 
 # Checkpoints
@@ -494,123 +348,3 @@ def test_two_processes_step_as_one(arguments, compose, tmp_path):
     # At first all are round: the gradient of their turns is nothing but rounding.
     assert max(ddp_rank.apart(compose(*more), [step]) for step in steps[1:]) < ddp_rank.APART
     assert checkpoint(tmp_path / "two")["state_dict"]["grad2d_count"].sum() > 0
-
-
-def test_it_grows_while_the_graph_of_an_earlier_step_lives(scene):
-    module = make(scene)
-    optimizers = module.configure_optimizers()
-    module.optimizers = lambda use_pl_optimizer: optimizers
-    kept = module.training_step(None, 0)["loss"]  # as a traceback would keep it
-    kept.backward(retain_graph=True)
-    optimizers.step()
-    moments = optimizers.state[module.tables["means"]]["exp_avg"].clone()
-    rows = torch.arange(len(module.grad2d)) >= 3
-    with torch.no_grad():
-        added = Gaussians(*(table[:7].clone() for table in module.gaussians))
-        module._replace(Change(rows, added))
-    stepped(module)
-    optimizers.step()
-    state = optimizers.state[module.tables["means"]]
-    assert state["step"] == 2
-    assert len(state["exp_avg"]) == len(moments) + 4
-    assert len(optimizers.state) == len(module.tables)
-
-
-def test_rows_that_stay_keep_their_moments_in_the_new_order(scene):
-    module = make(scene)
-    optimizers = module.configure_optimizers()
-    module.optimizers = lambda use_pl_optimizer: optimizers
-    stepped(module)
-    optimizers.step()
-    old = {
-        name: torch.cat([table.detach(), *(optimizers.state[table][each] for each in ("exp_avg", "exp_avg_sq"))], 1)
-        for name, table in module.tables.items()
-    }
-    kept = torch.arange(3, len(module.grad2d))
-    with torch.no_grad():
-        added = Gaussians(*(table[:7] + 5 for table in module.gaussians))
-        module._replace(Change(kept, added))
-    order = along_curve(module.tables["means"].detach())
-    assert order.tolist() == list(range(len(kept) + 7))
-    came = along_curve(torch.cat([old["means"][kept, :3], added.means]))
-    assert came.tolist() != sorted(came.tolist())
-    for name, table in module.tables.items():
-        state, fresh = optimizers.state[table], getattr(added, name)
-        new = torch.cat([old[name][kept], torch.cat([fresh, torch.zeros(7, 2 * fresh.shape[1])], 1)])[came]
-        assert torch.equal(torch.cat([table.detach(), state["exp_avg"], state["exp_avg_sq"]], 1), new)
-
-
-# Coarse to fine
-
-
-def tiny(patch: pytest.MonkeyPatch) -> None:
-    """Let pictures of 12 pixels be averaged."""
-    patch.setattr(scales, "MIN_SIDE", 3)
-    patch.setattr(scales, "OCTAVES", 3)
-
-
-@pytest.fixture(scope="module")
-def coarse(compose, tmp_path_factory) -> tuple[dict[str, Any], Path, list[tuple[int, int]], list[int]]:
-    """A run whose pictures have 3, 6 and 12 pixels a side, with alpha and masks' appearance; each step's width; the
-    steps that Adam's moments begin anew with.
-    """
-    config = compose(*SPLAT, *GROWS, "ctm=off", "appearance=exposure", "backbone.steps=18", "dataset.exposure=0.2")
-    widths, anew, render = [], [], Splat.render
-    with pytest.MonkeyPatch.context() as patch:
-        tiny(patch)
-
-        def seen(self, views, index, background, draws, every=1):
-            if draws is not None:
-                widths.append((self.global_step, views.width))
-                moments = [self.named_optimizers.state.get(table, {}) for table in self.tables.values()]
-                if not any(each["exp_avg"].any() or each["exp_avg_sq"].any() for each in moments if each):
-                    anew.append(self.global_step)
-            return render(self, views, index, background, draws, every)
-
-        patch.setattr(Splat, "render", seen)
-        run = tmp_path_factory.mktemp("coarse") / "whole"
-        train(config, run)
-    return config, run, widths, anew
-
-
-def test_pictures_grow_while_it_trains(coarse, monkeypatch):
-    _, run, widths, anew = coarse
-    tiny(monkeypatch)
-    module = load_posed(run).module
-    assert [stage.side for stage in module.stages] == [4, 2]
-    ends = [math.ceil(18 * stage.until) for stage in module.stages]
-    assert 0 < ends[0] < ends[1] < 18
-    assert widths == [(step, 3 if step < ends[0] else 6 if step < ends[1] else 12) for step in range(18)]
-    assert set(anew) - {5, 10, 15} == {0, *ends}  # growth may replace all
-    assert module.rays(0, 18) == pytest.approx(sum(width**2 for _, width in widths))
-    # Most of its steps are cheap; what it renders and is scored by is whole.
-    assert module.cost(0, 18) < 0.8 * Splat(dataclasses.replace(module.config, coarse=False), module.scene).cost(0, 18)
-    assert module.render_view(module.scene.test, 0)["rgb"].shape == (12, 12, 3)
-
-
-@pytest.mark.parametrize(("width", "place"), [(3, 1), (3, -1), (6, 1), (12, 1)])
-def test_it_goes_on_to_the_bit_in_the_middle_of_a_size_and_at_its_end(
-    coarse, width, place, tmp_path, ctrl_c, monkeypatch
-):
-    config, whole, widths, _ = coarse
-    tiny(monkeypatch)
-    batch = [step for step, each in widths if each == width][place]
-    interrupted(config, tmp_path / "run", ctrl_c, batch)
-    assert differences(tmp_path / "run", whole) == []
-
-
-def test_small_pictures_pull_as_the_whole_ones_do(scene):
-    """The gradient of what is large on the picture is that of whole pictures, but for what squares do not show."""
-    module = make(scene, dssim=0.0, degree=0, first=20)
-    with torch.no_grad():
-        module.tables["scales"].fill_(math.log(0.6))
-    stepped(module)
-    expected = {name: table.grad.clone() for name, table in module.tables.items()}
-    module.zero_grad()
-    module.batches_seen = 0
-    module.learn_from(scales.averaged(scene.train, 2))
-    module.cameras.clear()
-    stepped(module)
-    for name in ("means", "scales", "opacities", "sh0"):  # round ones have no turn
-        found, wanted = module.tables[name].grad.flatten(), expected[name].flatten()
-        assert (found - wanted).norm() < 0.4 * wanted.norm(), name

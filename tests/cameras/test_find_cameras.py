@@ -23,7 +23,7 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 from scipy.spatial.transform import Rotation
 
 from ctm_plugin import cli
-from ctm_plugin.appearance.gains import UNEVEN, gains_by_points
+from ctm_plugin.appearance.measured_gains import UNEVEN, gains_by_points
 from ctm_plugin.cameras import command
 from ctm_plugin.cameras.colmap import FILM_DIAGONAL, focal_length
 from ctm_plugin.cameras.lenses import with_focal_length

@@ -5,7 +5,7 @@ import pytest
 import torch
 from scipy.ndimage import gaussian_filter
 
-from ctm_plugin.cameras.refine import Sights, blurred, looked_up, moved
+from ctm_plugin.cameras.refine import PatchObservations, blurred, looked_up, moved
 
 SIDE, COUNT = 96, 6
 
@@ -23,10 +23,10 @@ def scene(moves: torch.Tensor, noise: float) -> dict[int, torch.Tensor]:
     return lights
 
 
-def sights(axes: torch.Tensor) -> Sights:
+def sights(axes: torch.Tensor) -> PatchObservations:
     """Four points that are seen in the middle of four quarters, by all alike."""
     places = torch.cartesian_prod(*[torch.tensor([32.0, 64.0])] * 2)
-    return Sights(torch.arange(4), [*range(4)], places, axes.expand(4, 2, 2))
+    return PatchObservations(torch.arange(4), [*range(4)], places, axes.expand(4, 2, 2))
 
 
 @pytest.mark.parametrize(("noise", "most"), [(0.0, 0.1), (1.0, 0.35)])

@@ -104,7 +104,7 @@ CASES: dict[str, tuple[Callable[[], tuple], int]] = {
     "ctm_plugin.rays.hash_grid.encoded": (of_encoded, 16 * 8),
     "ctm_plugin.rays.hash_grid.spread": (of_spread, 16 * 8 * 200),
     "ctm_plugin.rays.hash_density.log_density": (of_log_density, 16 * 8 + 6 + 18),
-    "ctm_plugin.rays.hash_density.lit": (of_lit, 16 * 8),
+    "ctm_plugin.rays.hash_density.visible_samples": (of_lit, 16 * 8),
     "ctm_plugin.optim.grid_adam.step_table": (of_step_table, 12),
     # Windows of 11 x 11, there and back; a variance is a difference.
     "ctm_plugin.color.dssim.dssim": (of_dssim, 8 * 2 * 11),

@@ -12,7 +12,7 @@ from ctm_scenes.trajectory import forward_facing
 from ctm_plugin.data.blender import BlenderConfig
 from ctm_plugin.data.embedded import StillLifeConfig
 from ctm_plugin.data.llff import LLFFConfig
-from ctm_plugin.data.load import settle
+from ctm_plugin.data.load import to_ndc_frame
 from ctm_plugin.data.near_far import ray_bounds
 from ctm_plugin.errors import ConfigError
 from ctm_plugin.scene.views import Points, Scene, Views
@@ -34,7 +34,7 @@ def grid(geometry: str, near: float = 2.0, target: tuple = (2.0, 1.0, 1.0)) -> S
 
 
 def test_forward_is_a_similarity_with_near_at_its_place():
-    old, new = grid("bounded"), settle(grid("forward"), Path("here"))
+    old, new = grid("bounded"), to_ndc_frame(grid("forward"), Path("here"))
     scale = 1 / (0.75 * old.near)
     assert (new.near, new.far) == (1.0, pytest.approx(8.0 * scale))
     torch.testing.assert_close(new.test.depth, old.test.depth * scale)
@@ -52,7 +52,7 @@ def test_points_move_with_the_cameras():
     positions = torch.tensor([[2.0, 1.0, 1.0], [2.5, 2.0, 0.5], [1.0, 4.0, 2.0]])
     points = Points(positions, point=torch.tensor([0, 2]), view=torch.tensor([1, 3]))
     old = replace(grid("forward"), points=points)
-    new = settle(old, Path("here"))
+    new = to_ndc_frame(old, Path("here"))
     seen = [
         torch.einsum("nji,npj->npi", c2w[:, :, :3], found[None] - c2w[:, None, :, 3])
         for c2w, found in ((s.train.c2w.double(), s.points.positions.double()) for s in (old, new))
@@ -60,13 +60,13 @@ def test_points_move_with_the_cameras():
     torch.testing.assert_close(seen[1], seen[0] / (0.75 * old.near), atol=1e-5, rtol=0)
     assert new.points.point is points.point
     assert new.points.view is points.view
-    assert settle(grid("forward"), Path("here")).points is None
+    assert to_ndc_frame(grid("forward"), Path("here")).points is None
 
 
 @pytest.mark.parametrize("geometry", ["bounded", "unbounded"])
 def test_others_stay_where_they_are(geometry):
     scene = grid(geometry)
-    assert settle(scene, Path("here")) is scene
+    assert to_ndc_frame(scene, Path("here")) is scene
 
 
 def test_bounds_out_of_depths():
@@ -83,11 +83,11 @@ def test_cameras_all_round_cannot_face_forward(tiny):
     with pytest.raises(ConfigError, match=message):
         StillLifeConfig(geometry="forward").load()
     with pytest.raises(ConfigError, match=r"dataset\.near: found 0\.0, expected more than 0 for dataset.geometry=fo"):
-        settle(grid("forward", near=0.0), Path("here"))
+        to_ndc_frame(grid("forward", near=0.0), Path("here"))
     scene = grid("forward")
     scene.train.c2w[0, :, 3] -= 3 * scene.train.c2w[0, :, 2]  # behind the others' near plane
     with pytest.raises(ConfigError, match=message):
-        settle(scene, Path("here"))
+        to_ndc_frame(scene, Path("here"))
 
 
 def test_unbounded_llff_keeps_the_files_units(ctm_data):

@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 
-from ctm_plugin.data.readers.key_frames import read_key_frames
+from ctm_plugin.data.readers.camera_path import read_key_frames
 from ctm_plugin.errors import DataError
 from ctm_plugin.scene.camera_paths import KeyFrames
 

@@ -2,7 +2,7 @@
 
 import torch
 
-from ctm_plugin.rays.hash_density import MAX_LOG_DENSITY, lit, log_density
+from ctm_plugin.rays.hash_density import MAX_LOG_DENSITY, log_density, visible_samples
 from ctm_plugin.rays.hash_grid import HashGrid
 
 
@@ -15,7 +15,7 @@ def test_samples_that_light_reaches():
     points, lengths = torch.rand(300, 3), 0.2 * torch.rand(300)
     ray_index = torch.arange(300) // 12
     network = grid.table, grid.sides, grid.starts, first, last
-    kept, features = lit(*network, points, lengths, ray_index, 25, 0.05)
+    kept, features = visible_samples(*network, points, lengths, ray_index, 25, 0.05)
     raw = last(first(grid(points)).relu())[:, 0].double()
     torch.testing.assert_close(log_density(*network, points).double(), raw, atol=1e-5, rtol=1e-5)
     alpha = 1 - (-raw.clamp_max(MAX_LOG_DENSITY).exp() * lengths).exp()
@@ -31,5 +31,5 @@ def test_samples_that_light_reaches():
     with torch.no_grad():
         last.bias[0] += 1000.0
     assert log_density(*network, points).min() > MAX_LOG_DENSITY
-    only, _ = lit(*network, points, torch.tensor([1e-8]), ray_index, 25, 1e-3)
+    only, _ = visible_samples(*network, points, torch.tensor([1e-8]), ray_index, 25, 1e-3)
     assert len(only) == 300  # exp(15) * 1e-8 of alpha each

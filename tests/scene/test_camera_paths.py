@@ -9,7 +9,7 @@ from ctm_scenes.trajectory import hemisphere, look_at
 from scipy.interpolate import CubicHermiteSpline
 from scipy.spatial.transform import Rotation, Slerp
 
-from ctm_plugin.scene.camera_paths import EASE, KeyFrames, capture, eased, focus, orbit, spiral, walk
+from ctm_plugin.scene.camera_paths import EASE, KeyFrames, capture, eased, focus, orbit, spiral, visiting_order
 from ctm_plugin.scene.views import Views
 
 
@@ -131,7 +131,7 @@ def test_names_in_no_order_make_the_same_film(arc):
     there, back = (capture(views(each), 16).double().numpy() for each in (arc, shuffled))
     off = min(np.abs(there - each).max() for each in (back, back[::-1]))
     assert off < 1e-5
-    assert list(walk(arc[:, :, 3])) == list(range(len(arc)))
+    assert list(visiting_order(arc[:, :, 3])) == list(range(len(arc)))
 
 
 def test_one_place_is_a_film_too():

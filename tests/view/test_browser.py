@@ -14,7 +14,7 @@ from PIL import Image
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
-from ctm_plugin.data.readers.key_frames import read_key_frames
+from ctm_plugin.data.readers.camera_path import read_key_frames
 from ctm_plugin.view.server import Viewer
 from ctm_plugin.view.settings import ViewConfig
 from ctm_plugin.view.sources import Subject

@@ -137,7 +137,7 @@ def test_photographs_that_were_added_are_searched_anew(capture, monkeypatch, cap
         asked.append(settings.overwrite)
         raise DataError(root, "no place", "some")
 
-    monkeypatch.setattr("ctm_plugin.cameras.command.place", place)
+    monkeypatch.setattr("ctm_plugin.cameras.command.find_and_write", place)
     monkeypatch.setattr("ctm_plugin.workflows.photos.added", lambda root, name: ["new.png"])
     assert main(["photos", str(capture), *SMALL]) == 1
     assert asked == [True]
@@ -151,7 +151,7 @@ def test_photographs_that_were_added_are_searched_anew(capture, monkeypatch, cap
 def test_uneven_photographs_are_evened_unless_told_otherwise(capture, monkeypatch, spread, more, expected):
     gains = torch.tensor([spread, -spread, torch.nan])
     monkeypatch.setattr("ctm_plugin.workflows.photos.model_folder", lambda root: root)
-    monkeypatch.setattr("ctm_plugin.appearance.gains.gains_by_points", lambda scene: gains)
+    monkeypatch.setattr("ctm_plugin.appearance.measured_gains.gains_by_points", lambda scene: gains)
     said = []
     chosen = choices(capture, 1.0, [*SMALL, *more], said.append)
     assert ("appearance=exposure" in chosen) == expected

@@ -17,7 +17,7 @@ from typing import IO, NamedTuple
 import numpy as np
 from jaxtyping import Float32
 
-from ctm_plugin.data.readers.folders import require_file, told
+from ctm_plugin.data.readers.folders import as_data_error, require_file
 from ctm_plugin.errors import CTMError, DataError
 
 CLIP_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".3gp", ".mts", ".m2ts")
@@ -69,7 +69,7 @@ def read_clip(path: Path) -> ClipHeader:
     if " Video: " not in output:
         if "Input #0" in output:
             raise DataError(path, "no moving pictures", CLIP_EXPECTED)
-        with told(path, "a clip that cannot be read", CLIP_EXPECTED):
+        with as_data_error(path, "a clip that cannot be read", CLIP_EXPECTED):
             raise OSError(_first(output))
     return header_of(output)
 
@@ -156,7 +156,7 @@ def _ffmpeg(path: Path) -> list[str]:
         from imageio_ffmpeg import get_ffmpeg_exe
     except ImportError as error:
         raise CTMError(f"reading clips needs ffmpeg: pip install -e '.[photos]' ({error})") from error
-    with told(path, "a clip, but no ffmpeg", "ffmpeg, or no IMAGEIO_FFMPEG_EXE"):
+    with as_data_error(path, "a clip, but no ffmpeg", "ffmpeg, or no IMAGEIO_FFMPEG_EXE"):
         program = get_ffmpeg_exe()
     return [program, "-hide_banner", "-nostdin", "-y", "-i", f"file:{path}"]
 

@@ -13,7 +13,7 @@ from jaxtyping import UInt16
 from PIL.ExifTags import Base
 from torch import Tensor
 
-from ctm_plugin.data.readers.folders import require_file, told
+from ctm_plugin.data.readers.folders import as_data_error, require_file
 from ctm_plugin.data.readers.picture import (
     MAX_PIXELS,
     Lens,
@@ -92,7 +92,7 @@ def open_deep(path: Path) -> Iterator[Opened]:
     Raises a DataError for channels other than grey or RGB with alpha, and for a cropped EXR.
     """
     require_file(path, EXPECTED)
-    with told(path, "a picture that cannot be read", EXPECTED), opened_file(path) as file:
+    with as_data_error(path, "a picture that cannot be read", EXPECTED), opened_file(path) as file:
         spec = file.spec()
         check_size(path, spec.width, spec.height, EXPECTED)
         names, kind = tuple(spec.channelnames), str(spec.format)

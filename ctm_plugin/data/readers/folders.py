@@ -46,7 +46,7 @@ def reason(error: BaseException) -> str:
 
 
 @contextmanager
-def told(path: Path, found: str, expected: str) -> Iterator[None]:
+def as_data_error(path: Path, found: str, expected: str) -> Iterator[None]:
     """Context that turns any error into a :class:`DataError` with the file, what was ``found`` and ``expected``.
 
     Systems and decoders raise all that their parsers do on damaged files: OSError, SyntaxError, struct.error, ... Where
@@ -64,7 +64,7 @@ def told(path: Path, found: str, expected: str) -> Iterator[None]:
 
 def require_folder(root: str | Path, expected: str) -> Path:
     """Find a data set's folder, or refuse it if missing; ``expected`` says in the error what it should hold."""
-    with told(Path(root), "a folder that cannot be read", expected):
+    with as_data_error(Path(root), "a folder that cannot be read", expected):
         root = Path(root).expanduser()
         if not root.exists():
             raise DataError(root, "nothing there", expected)
@@ -77,7 +77,7 @@ def require_folder(root: str | Path, expected: str) -> Path:
 
 def require_file(path: Path, expected: str) -> None:
     """Refuse a path that is no regular file: a pipe would block, a device never end. The file is not opened."""
-    with told(path, "a file that cannot be read", expected):
+    with as_data_error(path, "a file that cannot be read", expected):
         if not path.exists():
             raise DataError(path, "no such file", expected)
         if not path.is_file():
@@ -103,7 +103,7 @@ def state_of(path: Path) -> tuple[int, int] | None:
 def read_bytes(path: Path, expected: str) -> bytes:
     """Read a file's content."""
     require_file(path, expected)
-    with told(path, "a file that cannot be read", expected):
+    with as_data_error(path, "a file that cannot be read", expected):
         content = path.read_bytes()
     check_head(path, content, expected)
     return content
@@ -149,11 +149,11 @@ def look_for(root: Path, name: str, source: Path) -> Path | None:
     """
     for suffix in ("", *IMAGE_SUFFIXES):
         path = inside(root, name + suffix, source)
-        with told(path, "a file that cannot be read", "an image"):
+        with as_data_error(path, "a file that cannot be read", "an image"):
             if path.is_file():
                 return path
     *folders, last = inside(root, name, source).relative_to(root).parts or ("",)
-    with told(root / name, "a file that cannot be read", "an image"):
+    with as_data_error(root / name, "a file that cannot be read", "an image"):
         home = root
         for folder in folders:
             home = home / folder if (home / folder).is_dir() else folded(home).get(fold(folder), home / folder)

@@ -61,7 +61,7 @@ IGNORED_KEYS = (
 """Keys of known tools that do not concern the cameras, or tell what has been applied already."""
 
 
-def says(owner: Record, key: str) -> bool:
+def has_value(owner: Record, key: str) -> bool:
     """Tell whether a key has a value that matters: not missing, 0, false, null, or a list of these."""
     value = owner.values.get(key)
     return any(value) if isinstance(value, list) else bool(value)
@@ -77,20 +77,25 @@ def angle_alone(path: Path) -> bool:
 @lru_cache(maxsize=4)
 def _angle_alone(record: Record) -> bool:
     owners = [record, *(frames_of(record) if record.values.get("frames") else ())]
-    return not any(says(owner, key) for owner in owners for key in (*LENS_KEYS, *REFUSED_KEYS, MASK_KEY))
+    return not any(has_value(owner, key) for owner in owners for key in (*LENS_KEYS, *REFUSED_KEYS, MASK_KEY))
 
 
 def check_keys(owners: Iterable[Record]) -> None:
     """Refuse unsupported keys, and warn once of unknown ones, in files, each followed by its frames."""
     owners = list(owners)
-    masked = any(says(owner, MASK_KEY) for owner in owners)
+    masked = any(has_value(owner, MASK_KEY) for owner in owners)
     known = {*SIZE_KEYS, *LENS_KEYS, *REFUSED_KEYS, *FRAME_KEYS, *FILE_KEYS, *IGNORED_KEYS, "camera_angle_x"}
     unknown: dict[str, Path] = {}
     for owner in owners:
         for key in owner.values:
-            if key in REFUSED_KEYS and says(owner, key):
+            if key in REFUSED_KEYS and has_value(owner, key):
                 raise owner.fault(key, REFUSED_KEYS[key])
-            if "mask" in key and key not in known and says(owner, key) and not (masked and owner.values[key] is True):
+            if (
+                "mask" in key
+                and key not in known
+                and has_value(owner, key)
+                and not (masked and owner.values[key] is True)
+            ):
                 raise owner.fault(key, "masks under mask_path, whose bright pixels count, or no such key")
             if key not in known and not ("mask" in key and isinstance(owner.values[key], bool)):
                 unknown.setdefault(key, owner.source)

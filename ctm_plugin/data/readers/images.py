@@ -20,11 +20,11 @@ from ctm_plugin.data.readers.deep import colored, numbers, open_deep, opened_fil
 from ctm_plugin.data.readers.folders import (
     LFS_POINTER,
     PHONE_SUFFIXES,
+    as_data_error,
     check_head,
     others_hint,
     require_file,
     state_of,
-    told,
 )
 from ctm_plugin.data.readers.picture import (
     MAX_PIXELS,
@@ -63,7 +63,7 @@ def opened(path: Path) -> Iterator[Image.Image]:
     expected = f"a whole image ({', '.join(PILLOW_FORMATS)}, HEIC) of at most {MAX_PIXELS} pixels"
     require_file(path, expected)
     expected_whole = f"{expected}: copy it here again, or leave it out"
-    with told(path, "an image that cannot be read", expected_whole), path.open("rb") as file:
+    with as_data_error(path, "an image that cannot be read", expected_whole), path.open("rb") as file:
         head = file.read(len(LFS_POINTER))
         file.seek(0)
         heif = head[4:8] == b"ftyp" and head[8:12] not in AVIF_BRANDS
@@ -241,7 +241,7 @@ def map_numbers(path: Path, expected: str) -> np.ndarray:
     The file's length bounds what its header may claim.
     """
     require_file(path, expected)
-    with told(path, "no array that can be read", expected):
+    with as_data_error(path, "no array that can be read", expected):
         array = np.lib.format.open_memmap(path, mode="r")
     if array.dtype.kind != "f":
         raise DataError(path, f"an array of {array.dtype}, {list(array.shape)}", expected)

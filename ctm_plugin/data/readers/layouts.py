@@ -8,7 +8,7 @@ from difflib import get_close_matches
 from pathlib import Path
 
 from ctm_plugin.data.readers.clip import CLIP_SUFFIXES
-from ctm_plugin.data.readers.folders import is_picture, require_folder, told
+from ctm_plugin.data.readers.folders import as_data_error, is_picture, require_folder
 from ctm_plugin.data.readers.frames import angle_alone
 from ctm_plugin.errors import DataError
 
@@ -46,7 +46,7 @@ def open_layout(root: str | Path, layout: str) -> Path:
 def way_out(root: Path) -> str:
     """Word the hint for a folder without files of any layout: a folder near it that has some, or how to make them."""
     quoted = shlex.quote(str(root))
-    with told(root, "a folder that cannot be read", "the folder of a data set"):
+    with as_data_error(root, "a folder that cannot be read", "the folder of a data set"):
         for path in sorted(root.glob("*.[jJ][sS][oO][nN]")):
             if meant := get_close_matches(path.name.lower(), (TRANSFORMS, TRAIN, TEST, VAL), 1, 0.8):
                 return f"did you mean {meant[0]}, which dataset=transforms reads? {path.name} lies there"

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64
 
-from ctm_plugin.data.readers.folders import read_bytes, told
+from ctm_plugin.data.readers.folders import as_data_error, read_bytes
 from ctm_plugin.errors import DataError
 from ctm_plugin.scene.poses import MAX_COORDINATE
 
@@ -34,7 +34,7 @@ def read_ply(path: Path) -> Float64[np.ndarray, "p 3"]:
     encoding = next((line[1] for line in lines if line[:1] == ["format"] and len(line) > 1), None)
     if not lines or lines[0] != ["ply"] or encoding not in ("ascii", "binary_little_endian"):
         raise DataError(path, f"another header, of format {encoding}", PLY_EXPECTED)
-    with told(path, "vertices that cannot be read", PLY_EXPECTED):
+    with as_data_error(path, "vertices that cannot be read", PLY_EXPECTED):
         properties = [line[1:] for line in lines[first:last] if line[:1] == ["property"]]
         kinds = np.dtype([(name, f"<{PLY_TYPES[kind]}") for kind, name in properties])
         _, name, count = lines[first]

@@ -17,7 +17,7 @@ from PIL.ExifTags import IFD
 from torch import Tensor
 
 from ctm_plugin.color.srgb import linear_to_srgb
-from ctm_plugin.data.readers.folders import require_file, told
+from ctm_plugin.data.readers.folders import as_data_error, require_file
 from ctm_plugin.data.readers.hot_pixels import repair
 from ctm_plugin.data.readers.picture import MAX_PIXELS, Header, Lens, Opened, check_size, exposure_of, lens_of
 from ctm_plugin.errors import CTMError
@@ -44,7 +44,7 @@ def open_raw(
     rawpy = require_rawpy()
     expected = f"a raw picture that LibRaw can develop, of at most {MAX_PIXELS} pixels"
     require_file(path, expected)
-    with told(path, "a file that cannot be developed", expected), rawpy.imread(str(path)) as raw:
+    with as_data_error(path, "a file that cannot be developed", expected), rawpy.imread(str(path)) as raw:
         sizes = raw.sizes
         check_size(path, sizes.raw_width, sizes.raw_height, expected)
 
@@ -102,7 +102,7 @@ def read_raw(path: Path) -> RawHeader:
     rawpy = require_rawpy()
     expected = "a raw picture that LibRaw can develop: copy it here again, or leave it out"
     require_file(path, expected)
-    with told(path, "a file that cannot be developed", expected), rawpy.imread(str(path)) as raw:
+    with as_data_error(path, "a file that cannot be developed", expected), rawpy.imread(str(path)) as raw:
         sizes, balance = raw.sizes, tuple(raw.camera_whitebalance)
     turned, tags = {3: 3, 5: 8, 6: 6}.get(sizes.flip, 1), raw_exif(path)
     return RawHeader((sizes.height, sizes.width), turned, balance, exposure_of(tags), lens_of(tags, tags))
@@ -110,7 +110,10 @@ def read_raw(path: Path) -> RawHeader:
 
 def read_mosaic(path: Path) -> UInt16[np.ndarray, "h w"] | None:
     """Read a sensor's values of a raw picture; ``None``: it has no Bayer pattern."""
-    with told(path, "a file that cannot be developed", "a raw picture"), require_rawpy().imread(str(path)) as raw:
+    with (
+        as_data_error(path, "a file that cannot be developed", "a raw picture"),
+        require_rawpy().imread(str(path)) as raw,
+    ):
         bayer = raw.raw_pattern is not None and raw.raw_pattern.shape == (2, 2)
         return raw.raw_image_visible.copy() if bayer else None
 

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
-from ctm_plugin.data.readers.folders import inside, read_bytes, state_of, told
+from ctm_plugin.data.readers.folders import as_data_error, inside, read_bytes, state_of
 from ctm_plugin.errors import DataError
 from ctm_plugin.scene.poses import MAX_COORDINATE
 from ctm_plugin.settings.setting import Number, is_number
@@ -90,7 +90,7 @@ class Record:
 
 def parse_record(content: bytes, source: Path) -> Record:
     """Parse a file's JSON object, or the only object of a list, as exiftool writes it; else a DataError."""
-    with told(source, "something that is not JSON", "a JSON file"):
+    with as_data_error(source, "something that is not JSON", "a JSON file"):
         values = json.loads(content)
     values = values[0] if isinstance(values, list) and len(values) == 1 else values
     if not isinstance(values, dict):

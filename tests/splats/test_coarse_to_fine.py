@@ -8,7 +8,7 @@ from gaussian_scenes import LENS, views_of
 
 from ctm_plugin.rays.cameras import pixel_rays
 from ctm_plugin.scene.views import Views
-from ctm_plugin.splats.scales import MIN_SIDE, OCTAVES, SIDES, STAGE_POWER, averaged, stages
+from ctm_plugin.splats.coarse_to_fine import MIN_SIDE, OCTAVES, SIDES, STAGE_POWER, averaged, stages
 
 SIDE = SIDES[0] * MIN_SIDE
 

@@ -8,7 +8,7 @@ import torch
 from pictures import views
 
 from ctm_plugin.appearance.exposure import Exposure
-from ctm_plugin.appearance.gains import MIN_POINTS, gains_by_points, log_gains
+from ctm_plugin.appearance.measured_gains import MIN_POINTS, gains_by_points, log_gains
 from ctm_plugin.color.srgb import linear_to_srgb
 from ctm_plugin.scene.views import Points, Scene
 
