@@ -126,4 +126,5 @@ def load_run(run: str | Path) -> Run:
     Raises:
         CTMError: the folder is no such run, or it cannot be read.
     """
-    return Run(**vars(load_posed(Path(run), pictures=False)))
+    loaded = load_posed(Path(run), pictures=False)
+    return Run(loaded.parts, loaded.config, loaded.step, loaded.spent)

@@ -52,7 +52,7 @@ def first_seeds(runs: Sequence[Run]) -> dict[str, list[Run]]:
 def scene_entry(scene: str, runs: Sequence[Run]) -> dict:
     """The template's variables of a scene: its title, the runs' names, and the pictures of the sliders by kind.
 
-    Runs are numbered from 1, the photograph is 0. ``window`` is the part of the picture where two runs differ most.
+    Runs are numbered from 1, the photograph is 0. A slider's ``windows`` are the parts where two runs differ most.
 
     At first the sliders show plain RGB and ``ctm=auto``, or another transform where that is missing.
     """

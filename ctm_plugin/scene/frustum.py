@@ -19,7 +19,7 @@ from ctm_plugin.scene.views import Scene, Views
 
 
 def edge_points(extents: Tensor, points: int = 33) -> tuple[Tensor, Tensor]:
-    """x and y ``[..., points^2]`` of a regular grid over pictures of ``extents`` (width, height) ``[..., 2]``, in pixels.
+    """x and y ``[..., points^2]`` in pixels, a regular grid over pictures of ``extents`` (width, height) ``[..., 2]``.
 
     ``points`` lie on a side, the first and the last on the picture's borders.
     """

@@ -13,6 +13,12 @@ from ctm_plugin.show.walk import Spots, Start, walk
 START = Start(np.array([5.0, 0, 0]), np.zeros(3), np.array([0, 0, 1.0]), 0.6)
 PER_SPOT = 8
 """Numbers of 32 bits: a place and a free one, six of 16 bits of the covariance, a colour."""
+COMPILED = """() => {
+    const gl = document.createElement("canvas").getContext("webgl2"), shader = gl.createShader(gl.VERTEX_SHADER);
+    gl.shaderSource(shader, "precision mediump float;");
+    return gl.getShaderSource(shader);
+}"""
+"""Script that gives a vertex shader's text as the page compiles it."""
 
 
 def sheets(*depths: float, size: float = 0.1, count: int = 500) -> Spots:
@@ -48,4 +54,5 @@ def test_what_is_near_hides_what_is_far_in_a_page_that_is_opened_as_a_file(tmp_p
     with opened(address, lambda url: not url.startswith(("file:", "data:", "blob:")), viewport=size) as page:
         middle = {"x": 300, "y": 200, "width": 40, "height": 40}
         until(lambda: (seen(page, middle).mean((0, 1)) @ [1, 0, -1]) > 100, "red", seconds=40)
+        assert page.evaluate(COMPILED) == "precision highp float;"  # else covariances may have 16 bits
         assert page.told == []

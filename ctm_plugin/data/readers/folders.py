@@ -25,7 +25,8 @@ RAW_SUFFIXES = (
 )  # fmt: skip
 """Suffixes of raw pictures."""
 RAW_HINT = (
-    "raw pictures developed all alike to TIFF of 16 bits; raw ones are read in RawNeRF's layout, by dataset=rawnerf"
+    "pictures developed all alike to TIFF of 16 bits, as ctm photos FOLDER does; "
+    "dataset=rawnerf reads RawNeRF's raw ones"
 )
 
 
