@@ -124,7 +124,7 @@ def _comment(lines: list[str], mark: yaml.Mark) -> str:
 def documented(group: str, choice: str) -> list[Key]:
     """The keys of a choice: of a file that starts from another one, what it says itself; else all."""
     of, name = BESIDE[group](choice) if group in BESIDE else (group, registered(group, choice))
-    meanings, own = choices.told(of, name), keys(read(group, choice))
+    meanings, own = choices.key_meanings(of, name), keys(read(group, choice))
     if not (group in BESIDE or base(group, choice) or group in BARE):
         values = dict(listing.keys(choices.node(of, name))) | {key.name: key.value for key in own}
         return [Key(key, value, meanings[key]) for key, value in values.items() if key not in OWN_NAMES]
@@ -216,7 +216,7 @@ def rest() -> str:
     """The keys beside the groups, and the groups that nobody has to choose."""
     head = "# The rest\n\nKeys of a run beside its groups.\n\n"
     metrics = [
-        Key(f"metrics.{name}", value, choices.told("metrics")[name])
+        Key(f"metrics.{name}", value, choices.key_meanings("metrics")[name])
         for name, value in listing.keys(choices.node("metrics"))
     ]
     whole = table([*keys((CONF / "config.yaml").read_text(encoding="utf-8")), *metrics])
