@@ -6,6 +6,7 @@ import base64
 import io
 import math
 import os
+import re
 import shlex
 from collections.abc import Mapping, Sequence
 from importlib.util import find_spec
@@ -96,7 +97,7 @@ def page(run: Path, posed: LoadedRun, light: Light, scores: Mapping[str, Any], p
     """A run's page as HTML that needs no other file."""
     return html(
         Path(__file__).with_name("page.html.jinja"),
-        name=posed.module.scene.name,
+        name=re.sub(r"[_-]+", " ", posed.module.scene.name),
         dark=light != AS_IS,
         facts=facts(posed, light, scores),
         run=shlex.quote(os.path.relpath(run)),
@@ -115,15 +116,15 @@ def facts(posed: LoadedRun, light: Light, scores: Mapping[str, Any]) -> list[str
     """Sentences on a run's settings and scores, for its page."""
     scene, config = posed.module.scene, posed.config
     known, kept = len(scene.train), len(scene.test)
-    sentences = [f"The scene was learned from {known} photographs. {kept} places were held back, to test it."]
+    sentences = [f"The program used {known} photographs. {kept} more were kept aside, to test it."]
     if light != AS_IS:
         why = ", set automatically" if light == posed.light else ""
-        stops = f"{math.log2(light.gain):+.1f} stops"
-        sentences.append(f"It is shown {light.gain:.3g} times as bright as it was ({stops}){why}.")
+        sentences.append(f"It is shown {light.gain:.3g} times as bright as it was{why}.")
+        sentences.append("Where the photographs are almost black, they hardly tell colours: some may be wrong.")
     detail = scores.get("detail")
     if detail is not None:
-        share = f"{detail:.0%} of the fine detail of the photographs, whose grain is not counted"
-        sentences.append(f"The views show {share}{'' if detail >= LITTLE_DETAIL else ': something went wrong'}.")
+        wrong = "" if detail >= LITTLE_DETAIL else ": something went wrong"
+        sentences.append(f"Its views show {detail:.0%} of the smallest detail in the photographs{wrong}.")
     minutes = posed.spent["seconds"] / 60
     spots = f"{len(posed.module.gaussians.means):,} spots of colour" if isinstance(posed.module, Splat) else ""
     how = f"It took {minutes:.0f} minutes" if minutes >= 1.5 else f"It took {posed.spent['seconds']:.0f} seconds"

@@ -111,7 +111,8 @@ def test_of_places_without_photographs(own, monkeypatch):
     monkeypatch.setattr(pages, "find_spec", lambda name: None)
     monkeypatch.setattr(posed.module, "target", lambda view: None)
     write_page(own / "index.html", own, posed, posed.light)
-    assert "from places where nobody has taken a photograph" in text_of(own)
+    assert "From other places" in text_of(own)
+    assert "Before and after" not in text_of(own)
     assert 'class="stage compare"' not in text_of(own)
     assert pictures(text_of(own)) == pages.MAX_VIEWS
 
@@ -126,7 +127,7 @@ def forward_page(hall, trained, tmp_path_factory) -> str:
 
 
 def test_a_lit_scene_is_compared_with_its_photographs_alone(forward_page):
-    assert "Photographed in the dark" not in forward_page
+    assert "in the dark" not in forward_page
     assert "brightened" not in forward_page
 
 
@@ -134,12 +135,13 @@ def test_facts(own):
     posed = load_posed(own)
     told = pages.facts(posed, posed.light, {"detail": None})
     train, test = len(posed.module.scene.train), len(posed.module.scene.test)
-    assert told[0].startswith(f"The scene was learned from {train} photographs. {test} places were held back")
-    assert "stops" in told[1]
+    assert told[0].startswith(f"The program used {train} photographs. {test} more were kept aside")
+    assert "times as bright" in told[1]
+    assert "colours" in told[2]
     assert not any("detail" in each for each in told)
-    assert "10% of the fine detail" in pages.facts(posed, posed.light, {"detail": 0.1})[2]
-    assert "something went wrong" in pages.facts(posed, posed.light, {"detail": 0.1})[2]
-    assert "wrong" not in pages.facts(posed, posed.light, {"detail": 0.6})[2]
+    assert "10% of the smallest detail" in pages.facts(posed, posed.light, {"detail": 0.1})[3]
+    assert "something went wrong" in pages.facts(posed, posed.light, {"detail": 0.1})[3]
+    assert "wrong" not in pages.facts(posed, posed.light, {"detail": 0.6})[3]
 
 
 def test_pictures_of_several_sizes_are_shown_without_what_fills_the_canvas(own, monkeypatch):
@@ -172,7 +174,8 @@ def test_in_a_browser(own):
         before = left.evaluate("of => getComputedStyle(of).clipPath")
         slider.fill("20")
         assert left.evaluate("of => getComputedStyle(of).clipPath") != before
-        page.get_by_text("photograph, simply brightened").first.click()
+        page.get_by_role("button", name="photograph, brightened").click()
+        assert page.locator(".of-left").first.text_content() == "photograph, brightened"
         assert [page.locator(".compare .left").nth(n).is_visible() for n in (0, 1)] == [False, True]
         stage = page.locator("#walk")
         page.set_viewport_size({"width": 700, "height": 300})
@@ -196,4 +199,6 @@ def test_in_a_browser(own):
             return np.abs(seen(page, inside) - shown).mean() > 5
 
         until(dragged, "another picture when it is dragged", seconds=60)
+        page.get_by_role("button", name="Close").click()
+        assert page.locator("iframe").count() == 0
         assert page.told == []
