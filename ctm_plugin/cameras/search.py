@@ -135,7 +135,7 @@ def find_cameras(
                     work = work.with_headers(headers, settings.lens, pairs)
                     with stage("placed", len(paths)) as done:
                         model = trusted(work.reconstruct(names, start, done), work.database)
-                if (model.sights, model.placed) > (best.sights, best.placed):
+                if (model.observations, model.placed) > (best.observations, best.placed):
                     best, taken = model, rung
                 if sound := best.placed >= ENOUGH_PLACED * len(paths) and not best.taken_out:
                     break
@@ -168,7 +168,7 @@ def find_cameras(
         )
     with stage("refined", taken.refined[1]) as done:
         refine(best.model, lights, *taken.refined, settings.threads, done)
-    return best._replace(count_observations=count_observations(best.model)), gain
+    return best._replace(observations=count_observations(best.model)), gain
 
 
 def search_summary(trusted: Trusted, count: int) -> str:

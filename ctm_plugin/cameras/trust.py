@@ -25,18 +25,18 @@ class Trusted(NamedTuple):
         model: COLMAP's model; ``None``: no picture got a pose.
         placed: number of pictures in the model.
         taken_out: number of pictures removed from it.
-        sights: see :func:`~ctm_plugin.cameras.colmap.sights`.
+        observations: see :func:`~ctm_plugin.cameras.colmap.count_observations`.
     """
 
     model: Reconstruction | None = None
     placed: int = 0
     taken_out: int = 0
-    sights: int = 0
+    observations: int = 0
 
     @property
     def mean(self) -> float:
         """Mean number of :func:`count_observations` a picture."""
-        return self.sights / max(self.placed, 1)
+        return self.observations / max(self.placed, 1)
 
 
 def trusted(model: Reconstruction | None, database: Path) -> Trusted:

@@ -252,10 +252,10 @@ def test_blank_pictures_have_no_cameras_and_what_was_there_stays(tmp_path):
 # Without COLMAP
 
 
-@pytest.mark.parametrize(("sights", "few"), [(99, True), (100, False)])
-def test_places_that_few_points_hold_are_told(tmp_path, capsys, sights, few):
+@pytest.mark.parametrize(("observations", "few"), [(99, True), (100, False)])
+def test_places_that_few_points_hold_are_told(tmp_path, capsys, observations, few):
     numbers = {"num_points3D": lambda: 9, "compute_mean_reprojection_error": lambda: 0.5, "reg_image_ids": list}
-    command.tell(tmp_path, [], Trusted(SimpleNamespace(**numbers), 1, 0, sights), 1.0)
+    command.tell(tmp_path, [], Trusted(SimpleNamespace(**numbers), 1, 0, observations), 1.0)
     assert (", few: places may be off by some percent" in capsys.readouterr().out) == few
 
 

@@ -23,7 +23,7 @@ def scene(moves: torch.Tensor, noise: float) -> dict[int, torch.Tensor]:
     return lights
 
 
-def sights(axes: torch.Tensor) -> PatchObservations:
+def observations(axes: torch.Tensor) -> PatchObservations:
     """Four points that are seen in the middle of four quarters, by all alike."""
     places = torch.cartesian_prod(*[torch.tensor([32.0, 64.0])] * 2)
     return PatchObservations(torch.arange(4), [*range(4)], places, axes.expand(4, 2, 2))
@@ -33,7 +33,7 @@ def sights(axes: torch.Tensor) -> PatchObservations:
 def test_moves_are_found_but_for_a_common_one(noise, most):
     chance = torch.Generator().manual_seed(0)
     moves = torch.randn(COUNT, 2, generator=chance) * 0.7
-    seen = {view + 1: sights(torch.eye(2)) for view in range(COUNT)}
+    seen = {view + 1: observations(torch.eye(2)) for view in range(COUNT)}
     found = moved(seen, scene(moves, noise), 10)
     places = torch.stack([torch.from_numpy(found[view][1]).float() - seen[view].middles for view in seen])
     error = (places - places.mean(0)) - (moves - moves.mean(0))[:, None]
@@ -45,8 +45,8 @@ def test_patches_follow_how_a_picture_is_turned():
     """The second picture is the first upside down: what is to the right there is to the left here."""
     lights = scene(torch.zeros(COUNT, 2), 0.0)
     lights[2] = lights[2].flip(0, 1)
-    seen = {view + 1: sights(torch.eye(2)) for view in range(COUNT)}
-    upside = sights(-torch.eye(2))
+    seen = {view + 1: observations(torch.eye(2)) for view in range(COUNT)}
+    upside = observations(-torch.eye(2))
     seen[2] = upside._replace(middles=SIDE - upside.middles + torch.tensor([0.9, -0.8]))
     found = torch.from_numpy(moved(seen, lights, 10)[2][1]).float()
     torch.testing.assert_close(found, SIDE - upside.middles, atol=0.3, rtol=0)
@@ -56,7 +56,7 @@ def test_what_cannot_be_told_does_not_count():
     """One picture shows something else; a patch reaches out of another."""
     lights = scene(torch.zeros(COUNT, 2), 0.0)
     lights[2] = 4 * lights[2].flip(0)
-    seen = {view: sights(torch.eye(2)) for view in lights}
+    seen = {view: observations(torch.eye(2)) for view in lights}
     seen[1].middles[0] = torch.tensor([5.0, 32.0])
     good = {view: kept for view, (_, _, kept) in moved(seen, lights, 10).items()}
     assert good == {view: [view not in (1, 2)] + [view != 2] * 3 for view in lights}

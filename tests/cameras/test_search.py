@@ -28,7 +28,7 @@ HOLLOW = Trusted("hollow", 4, 0, 4 * 3)
 def searched(tmp_path, monkeypatch):
     """Search where COLMAP finds canned models in turn; noted is which details and start each was asked for with."""
     monkeypatch.setattr(search, "refine", lambda model, lights, reach, rounds, threads, done: done(rounds))
-    monkeypatch.setattr(search, "sights", lambda model: 7)
+    monkeypatch.setattr(search, "count_observations", lambda model: 7)
     for name in "abcd":
         iio.imwrite(tmp_path / f"{name}.png", np.full((6, 8, 3), 9, dtype=np.uint8))
     pictures = [read_picture(path) for path in sorted(tmp_path.glob("*.png"))]
@@ -79,7 +79,7 @@ def searched(tmp_path, monkeypatch):
         found, _ = find_cameras(pictures, [each.path.name for each in pictures], CamerasConfig(threads=1), tmp_path)
         for folder in tmp_path.iterdir():
             shutil.rmtree(folder, ignore_errors=True)
-        assert found.sights == 7  # of the refined one
+        assert found.observations == 7  # of the refined one
         return found.model, noted
 
     return search_for
@@ -113,7 +113,7 @@ def test_places_that_contradict_the_matches_are_searched_again(searched, capsys)
 
 
 def test_thin_models_are_searched_again_with_pooled_details(searched, capsys):
-    """The one that more sights hold is taken."""
+    """The one that more observations hold is taken."""
     assert searched(NOISY, GOOD) == ("good", [("usual", STANDARD), ("pooled", FEWER_MATCHES)])
     assert "a mean one sees 80 points that two others see: searched again for details pooled" in capsys.readouterr().err
     assert searched(NOISY, FEW)[0] == "noisy"

@@ -172,7 +172,7 @@ def test_dng_points_to_the_layout_that_reads_it(yard):
     names = [f"f_{index:02d}.png" for index in range(COUNT)]
     names[3] = "f_03.dng"
     write_images(yard / "sparse/0/images.bin", hemisphere(COUNT, 4.0, seed=3), [[10, 11]] * COUNT, names)
-    with pytest.raises(DataError, match=r"f_03\.dng: found a raw picture, expected .* by dataset=rawnerf"):
+    with pytest.raises(DataError, match=r"f_03\.dng: found a raw picture, expected .* dataset=rawnerf"):
         load(yard)
 
 

@@ -90,5 +90,5 @@ def test_dng(tmp_path):
     with pytest.raises(DataError, match=r"IMG_001\.dng: found a raw picture, expected .*dataset=rawnerf"):
         PlanarConfig(image=root / "raw/IMG_001.dng").load()
     (root / "raw").rename(root / "images")
-    with pytest.raises(DataError, match=r"images: found no pictures, expected files ending in .*by dataset=rawnerf"):
+    with pytest.raises(DataError, match=r"images: found no pictures, expected files ending in .*dataset=rawnerf"):
         build(DATASETS.get("llff"), {"root": str(root)}, "dataset").load()
