@@ -1,6 +1,6 @@
 """Trainings of splats beside OpenSplat's: the same pictures, cameras and first points, each on one core.
 
-``python benchmarks/splat_train_peer.py PEER DATA "peer -n 500" "ours trainer=quick" ... [--pictures low]``
+``python benchmarks/splat_train_peer.py PEER DATA ["peer -n 500" "ours trainer=quick" ...] [--pictures low]``
 
 PEER is a checkout of https://github.com/WebODM/OpenSplat at bd0400d, built for the CPU in PEER/build; DATA a scene of
 LOM, whose test views neither side trains on. Photographs are freed of their lens for both, as the peer does it. Seconds
@@ -17,7 +17,7 @@ import shutil
 import sys
 import tempfile
 from pathlib import Path
-from subprocess import DEVNULL, Popen
+from subprocess import check_output
 
 import numpy as np
 import torch
@@ -33,16 +33,18 @@ from ctm_plugin.rays.cameras import distort
 from ctm_plugin.runs.assemble import assemble
 from ctm_plugin.scene.views import composite
 
+TRAININGS = ("ours trainer=quick backbone.steps=400", "ours trainer=quick", "peer -n 2000")
 SHARE = 0.992  # sides of a picture without blank corners, of the photograph's
+RUN = """import resource, subprocess, sys
+subprocess.run(sys.argv[1:], check=True, stdout=subprocess.DEVNULL)
+print(*resource.getrusage(resource.RUSAGE_CHILDREN)[:3])"""  # a process of its own: a parent's memory would count
 
 
 def spent(*command: object) -> str:
     """Seconds of the processor and peak memory of a command, which has to succeed."""
     env = os.environ | dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"), "1")
-    process = Popen([*map(str, command)], env=env, stdout=DEVNULL)
-    _, status, used = os.wait4(process.pid, 0)
-    assert status == 0, command
-    return f"{used.ru_utime + used.ru_stime:.0f} s, {used.ru_maxrss / 2**20:.2f} GiB"
+    user, system, memory = map(float, check_output([sys.executable, "-c", RUN, *map(str, command)], env=env).split())
+    return f"{user + system:.1f} s, {memory / 2**20:.2f} GiB"
 
 
 def freed(path: Path, size: Tensor, focal: Tensor, centre: Tensor, distortion: Tensor) -> Image.Image:
@@ -90,7 +92,7 @@ def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("peer", type=lambda path: Path(path).resolve() / "build" / "opensplat")
     parser.add_argument("data", type=lambda path: Path(path).resolve())
-    parser.add_argument("trainings", nargs="+", help="a side and its options each")
+    parser.add_argument("trainings", nargs="*", default=TRAININGS, help="a side and its options each")
     parser.add_argument("--pictures", default="high", help="folder of the photographs")
     parser.add_argument("--out", type=lambda path: Path(path).resolve(), default=tempfile.mkdtemp(), help="new folder")
     args = parser.parse_args()
@@ -109,9 +111,8 @@ def main() -> None:
             found = scored(module, Path(f"{made}.ply"))
         else:
             cost = spent(sys.executable, *ours, *options, f"hydra.run.dir={made}")
-            tables = torch.load(made / "checkpoints" / "last.ckpt", weights_only=False)["state_dict"]
-            found = f"{len(tables['tables.means'])} Gaussians"
-            found += f", {json.loads((made / 'metrics.json').read_text())['psnr']:.2f} dB"
+            means = torch.load(made / "checkpoints" / "last.ckpt", weights_only=False)["state_dict"]["tables.means"]
+            found = f"{len(means)} Gaussians, {json.loads((made / 'metrics.json').read_text())['psnr']:.2f} dB"
         print(f"{training}: {cost}, {found}", flush=True)
 
 
