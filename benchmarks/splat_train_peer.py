@@ -111,7 +111,7 @@ def main() -> None:
             found = scored(module, Path(f"{made}.ply"))
         else:
             cost = spent(sys.executable, *ours, *options, f"hydra.run.dir={made}")
-            means = torch.load(made / "checkpoints" / "last.ckpt", weights_only=False)["state_dict"]["tables.means"]
+            means = torch.load(made / "checkpoints" / "last.ckpt", weights_only=True)["state_dict"]["tables.means"]
             found = f"{len(means)} Gaussians, {json.loads((made / 'metrics.json').read_text())['psnr']:.2f} dB"
         print(f"{training}: {cost}, {found}", flush=True)
 
