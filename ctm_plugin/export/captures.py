@@ -53,19 +53,19 @@ class CapturedView(NamedTuple):
         testing: whether it is a test view.
         lens: intrinsics and distortion.
         pose: camera to world, in the files' world.
-        sight: the points that the view observes.
+        observed: the points that the view observes.
     """
 
     file: str
     testing: bool
     lens: Intrinsics
     pose: Float[np.ndarray, "3 4"]
-    sight: PointObservations
+    observed: PointObservations
 
 
 NO_DOTS = Dots(np.empty((0, 3)), np.empty((0, 3)), np.empty((0, 3), np.uint8))
 """A cloud without points."""
-NO_SIGHTS = PointObservations(np.empty(0, np.int64), np.empty((0, 2)), np.empty((0, 3), np.uint8))
+NO_OBSERVATIONS = PointObservations(np.empty(0, np.int64), np.empty((0, 2)), np.empty((0, 3), np.uint8))
 """The observations of a picture that sees no point."""
 
 
@@ -111,8 +111,8 @@ def write_capture(
                 mask = torch.ones(views.height, views.width) if views.mask is None else views.mask[index]
                 write_pixels(folder / f"masks/{name}.png", mask[..., None].to(torch.uint8) * 255)
             known = points is not None and split == "train" and image is not None
-            sight = seen(points, views, index, image) if known else NO_SIGHTS
-            shots.append(CapturedView(f"{name}.{kind}", split == "test", lens_of(views, index), poses[index], sight))
+            observed = seen(points, views, index, image) if known else NO_OBSERVATIONS
+            shots.append(CapturedView(f"{name}.{kind}", split == "test", lens_of(views, index), poses[index], observed))
     if dots is None:
         dots, shots = coloured(scene, shots)
     write_sparse(folder / "sparse/0", shots, dots)
@@ -131,8 +131,8 @@ def write_capture(
 def write_sparse(folder: Path, shots: Sequence[CapturedView], dots: Dots) -> None:
     """Write COLMAP's model of these views and points, and which are for testing."""
     cameras = {lens: number for number, lens in enumerate(dict.fromkeys(each.lens for each in shots), 1)}
-    taken = [Taken(each.file, each.pose, cameras[each.lens], each.sight.rows + 1) for each in shots]
-    write_model(folder, list(cameras), taken, [each.sight.places for each in shots], dots.positions, dots.colors)
+    taken = [Taken(each.file, each.pose, cameras[each.lens], each.observed.rows + 1) for each in shots]
+    write_model(folder, list(cameras), taken, [each.observed.places for each in shots], dots.positions, dots.colors)
     write_text(folder / "test.txt", "".join(f"{each.file}\n" for each in shots if each.testing))
 
 
@@ -176,7 +176,7 @@ def coloured(scene: Scene, shots: Sequence[CapturedView]) -> tuple[Dots, list[Ca
     The normals are 0, as they are unknown.
     """
     count = 0 if scene.points is None else len(scene.points.positions)
-    rows, _, colors = (np.concatenate(part) for part in zip(*(each.sight for each in shots), strict=True))
+    rows, _, colors = (np.concatenate(part) for part in zip(*(each.observed for each in shots), strict=True))
     times = np.bincount(rows, minlength=count)
     kept = times > 0
     if not kept.any():
@@ -185,7 +185,7 @@ def coloured(scene: Scene, shots: Sequence[CapturedView]) -> tuple[Dots, list[Ca
     positions = (scene.world or IDENTITY).inverse().moved(scene.points.positions.double().numpy()[kept])
     dots = Dots(positions, np.zeros_like(positions), (sums[kept] / times[kept, None]).round().astype(np.uint8))
     row = np.cumsum(kept) - 1
-    return dots, [each._replace(sight=each.sight._replace(rows=row[each.sight.rows])) for each in shots]
+    return dots, [each._replace(observed=each.observed._replace(rows=row[each.observed.rows])) for each in shots]
 
 
 def write_pixels(path: Path, image: Tensor) -> None:

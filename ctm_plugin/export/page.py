@@ -97,7 +97,7 @@ def page(run: Path, posed: LoadedRun, light: Light, scores: Mapping[str, Any], p
     """A run's page as HTML that needs no other file."""
     return html(
         Path(__file__).with_name("page.html.jinja"),
-        name=re.sub(r"[_-]+", " ", posed.module.scene.name),
+        name=re.sub(r"[_-]+", " ", posed.module.scene.name).strip() or posed.module.scene.name,
         dark=light != AS_IS,
         facts=facts(posed, light, scores),
         run=shlex.quote(os.path.relpath(run)),
