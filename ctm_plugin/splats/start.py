@@ -13,6 +13,7 @@ from ctm_plugin.rays.cameras import pixel_rays
 from ctm_plugin.scene.frustum import projected, view_counts, visual_hull
 from ctm_plugin.scene.views import Scene, composite
 from ctm_plugin.splats.gaussians import Gaussians
+from ctm_plugin.splats.sweep import swept_places
 
 MIN_POINTS = 300
 """Least number of a reconstruction's points to start from."""
@@ -32,9 +33,10 @@ def first_places(scene: Scene, count: int, seed: int) -> tuple[Float[Tensor, "n 
     """Choose the initial positions of Gaussians, and the sRGB colours that training pictures have there.
 
     Args:
-        scene: scene whose ``points`` are taken, with random ones added where they are fewer than 300.
+        scene: scene whose ``points`` are taken, with those of a plane sweep; random ones are added where the points are
+            fewer than 300.
         count: number of random points.
-        seed: seed of the random points.
+        seed: seed of the random points, and of the sweep's.
     """
     points = scene.points
     given = torch.empty(0, 3) if points is None else points.positions
@@ -43,7 +45,9 @@ def first_places(scene: Scene, count: int, seed: int) -> tuple[Float[Tensor, "n 
     tracked = torch.zeros(0, 2, dtype=torch.long)
     if points is not None and len(points.point):
         tracked = torch.stack([points.point, points.view], 1)
-    return places, colors_of(scene, places, tracked)
+    colors = colors_of(scene, places, tracked)
+    swept, shown = swept_places(scene, seed)
+    return torch.cat([places, swept]), torch.cat([colors, shown])
 
 
 def random_places(scene: Scene, count: int, seed: int) -> Float[Tensor, "n 3"]:
