@@ -40,7 +40,7 @@ SETTINGS = {
 at one another's settings share one run; where it fails, each alone tells whose it is."""
 
 ROOMS = ("appearance", "backbones", "color", "cpu", "metrics", "optim", "rays", "scene", "splats")
-OF_DATA = ("degrade", "develop", "geometry", "lit", "near_far", "planar", "resample")
+OF_DATA = ("degrade", "develop", "geometry", "lit_references", "near_far", "planar", "resample")
 """The tests of data that compute; the others read files."""
 NUMERICAL = [f"tests/{name}" for name in (*ROOMS, *(f"data/test_{name}.py" for name in OF_DATA))]
 LEFT_OUT = {

@@ -58,7 +58,7 @@ STEP_WAITS = {
     "dvgo, forward": PACKED,
     "nerf": [],
     # Samples of each ray, those outside free space, those that light reaches, those with alpha, those with weight.
-    "ngp": [*PACKED[:2], "nonzero in lit", *PACKED[2:]],
+    "ngp": [*PACKED[:2], "nonzero in visible_samples", *PACKED[2:]],
     "splat": ["nonzero in rasterize"],  # in plain torch: which Gaussians meet a tile, of which there is one
     "barf2d": [],
     "barf2d, all pixels": [],

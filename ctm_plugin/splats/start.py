@@ -13,7 +13,7 @@ from ctm_plugin.rays.cameras import pixel_rays
 from ctm_plugin.scene.frustum import projected, view_counts, visual_hull
 from ctm_plugin.scene.views import Scene, composite
 from ctm_plugin.splats.gaussians import Gaussians
-from ctm_plugin.splats.sweep import swept_places
+from ctm_plugin.splats.plane_sweep import swept_places
 
 MIN_POINTS = 300
 """Least number of a reconstruction's points to start from."""

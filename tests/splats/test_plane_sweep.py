@@ -9,7 +9,7 @@ from gaussian_scenes import views_of
 from torch import Tensor
 
 from ctm_plugin.scene.views import Scene
-from ctm_plugin.splats.sweep import swept_places
+from ctm_plugin.splats.plane_sweep import swept_places
 
 HIGH, WIDE, FOCAL, DEPTH = 60, 80, 80.0, 5.0
 
