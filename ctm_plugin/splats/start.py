@@ -33,8 +33,8 @@ def first_places(scene: Scene, count: int, seed: int) -> tuple[Float[Tensor, "n 
     """Choose the initial positions of Gaussians, and the sRGB colours that training pictures have there.
 
     Args:
-        scene: scene whose ``points`` are taken, with those of a plane sweep; random ones are added where the points are
-            fewer than 300.
+        scene: scene whose ``points`` are taken; where they are fewer than 300, random ones and a plane sweep's are
+            added.
         count: number of random points.
         seed: seed of the random points, and of the sweep's.
     """
@@ -46,7 +46,7 @@ def first_places(scene: Scene, count: int, seed: int) -> tuple[Float[Tensor, "n 
     if points is not None and len(points.point):
         tracked = torch.stack([points.point, points.view], 1)
     colors = colors_of(scene, places, tracked)
-    swept, shown = swept_places(scene, seed)
+    swept, shown = swept_places(scene, seed) if len(drawn) else (drawn, drawn)
     return torch.cat([places, swept]), torch.cat([colors, shown])
 
 
