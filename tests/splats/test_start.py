@@ -49,6 +49,15 @@ def test_enough_points_are_all_there_is(row):
     assert colors.shape == (MIN_POINTS, 3)
 
 
+def test_a_plane_sweep_is_asked_where_points_are_few(row, monkeypatch):
+    one = torch.tensor([[0.0, 1.0, -7.0]])
+    monkeypatch.setattr("ctm_plugin.splats.start.swept_places", lambda scene, seed: (one, one / 10))
+    for count, asked in ((MIN_POINTS, False), (MIN_POINTS - 1, True), (0, True)):
+        places, colors = first_places(with_points(row, torch.ones(count, 3)), 40, 0)
+        assert len(places) == len(colors) == count + 41 * asked
+        assert torch.equal(places[-1:], one) == torch.equal(colors[-1:], one / 10) == asked
+
+
 def test_few_points_have_random_ones_beside_them(row):
     positions = torch.randn(MIN_POINTS - 1, 3, generator=torch.Generator().manual_seed(0)) - torch.tensor(
         [0.0, 0.0, 5.0]
